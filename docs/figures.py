@@ -73,13 +73,13 @@ FIGURES = (
     Figure(
         ("compare.png",),
         """mitsuba-diffraction compare scenes/elaphe.xml -D light=sun --shader flss --shader nmm --shader pq \
-            --shader gem --width 216 --spp 256 --shading-points 9 -o {out}/compare""",
+            --shader gem --width 180 --spp 128 --shading-points 4 -o {out}/compare""",
         5,
     ),
     Figure(
         ("compare_xenopeltis.png",),
         """mitsuba-diffraction compare scenes/xenopeltis.xml -D light=sun --shader flss --shader nmm --shader pq \
-            --shader gem --width 216 --spp 256 --shading-points 9 -o {out}/compare_xenopeltis""",
+            --shader gem --width 180 --spp 128 --shading-points 4 -o {out}/compare_xenopeltis""",
         5,
     ),
     Figure(
@@ -108,6 +108,7 @@ FIGURES = (
     ),
     notebook("slits.png", "02_brdf_and_grating_equation", "cell-14", 6),
     Figure(("terms.png",), "mitsuba-diffraction benchmark --terms --plot {out}/terms.png", 10),
+    Figure(("published_snakes.png",), "python docs/thesis/published_snakes.py {out}/published_snakes.png", 3),
     Figure(("fourier_images.png", "interpolation.png"), "python docs/thesis/fourier_figures.py {out}"),
     Figure(("published_heights.png", "published_maps.png"), "python docs/thesis/published_maps.py {out}", 8),
     Figure(

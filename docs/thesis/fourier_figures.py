@@ -162,7 +162,7 @@ def plot_fourier_images(terms: int = FLSS.published_terms) -> Figure:
     for row, name in zip(axes, _SURFACES, strict=True):
         surface = SURFACES[name]
         field = _square(surface.height_field)
-        texels, height = taylor_transforms(field, terms, heights_from_zero=True, origin_at_centre=False, margin=0)
+        texels, height = taylor_transforms(field, terms, origin_at_centre=False, margin=0)
         width, depth = field.tile_size
         row[0].imshow(field.heights, cmap="gray", origin="lower", extent=(0, width, 0, depth))
         row[0].set_title(f"{surface.name}: h", fontsize=10)

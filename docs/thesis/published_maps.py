@@ -5,8 +5,8 @@
 Each is a picture of the outgoing hemisphere, light along the normal: (x, y) = (sin θ_o cos φ_o, sin θ_o sin φ_o). They
 were made by FLSS from an AFM scan of 65 µm, which is available, so that the emulation can be compared pixel by pixel.
 
-The series of FLSS is summed about the centre of the heights until it has converged: the map of Xenopeltis agrees with
-its height of 0.8187 µm, for which the 37 terms from the lowest point of the published shader (`TRUNCATED`) diverge.
+FLSS as published sums 37 terms about the centre of the heights. The thesis counts heights from the lowest point; for
+the map of Xenopeltis, whose height is 0.8187 µm, that series diverges.
 """
 
 from __future__ import annotations
@@ -47,7 +47,7 @@ if TYPE_CHECKING:
 Array = NDArray[np.float64]
 
 _FOLDER = Path(__file__).parents[2] / "precompute" / "measured" / "published"
-PUBLISHED, CORRECTED, TRUNCATED = "flss as published", "flss corrected", "flss truncated"
+PUBLISHED, CORRECTED = "flss as published", "flss corrected"
 METHODS = (PUBLISHED, CORRECTED, MODEL)
 
 SIDE, RADIUS = 800, 380
@@ -58,13 +58,9 @@ _MIRROR = 0.1  # sin θ_o; the pictures are saturated nearer to the mirror direc
 _LIGHT = (0.0, 0.0, 1.0)
 _COHERENCE_LENGTH = 65.0
 _SETTINGS = Settings(coherence_length=_COHERENCE_LENGTH, wavelengths=(380, 780), tolerance=0.01)
-_TERMS = {PUBLISHED: 50, TRUNCATED: 37}
-"""Of the series; the error of 50 about the centre is 1e-7 for 0.9 µm at 380 nm. Corrected, as many as needed."""
-# Relative radiance and the pictures' conversion of colours, so that maps differ by the light alone. Unlike the shader,
-# the pictures are not multiplied by the white point of D65.
+# Relative radiance and the pictures' conversion of colours, so that maps differ by the light alone.
 _QUIRKS = {
-    PUBLISHED: replace(Quirks.as_published(), d65_twice=False, heights_from_zero=False),
-    TRUNCATED: replace(Quirks.as_published(), d65_twice=False),
+    PUBLISHED: Quirks.as_published(),
     CORRECTED: replace(Quirks.corrected(), relative=True, cie_rgb_matrix=True),
 }
 
@@ -163,7 +159,7 @@ def linear_rgb(published: PublishedMap, method: str, wo: ArrayLike) -> Array:
 
     Args:
         published: the map.
-        method: one of `METHODS`, or `TRUNCATED`.
+        method: one of `METHODS`.
         wo: ω_o, (n, 3).
 
     Returns:
@@ -173,14 +169,13 @@ def linear_rgb(published: PublishedMap, method: str, wo: ArrayLike) -> Array:
         xyz = relative_reflectance(published.recipe.cached(), _LIGHT, wo, wavelengths()) @ (
             WAVELENGTH_STEP * d65_weights()[:: int(WAVELENGTH_STEP)]
         )
-        return xyz @ rgb_matrix(cie_rgb_matrix=True, d65_twice=False).T
+        return xyz @ rgb_matrix(cie_rgb_matrix=True).T
     return shader_rgb(published.recipe.height_field(), method, wo, [1.0])[0]
 
 
 def shader_rgb(height_field: HeightField, method: str, wo: ArrayLike, height_scales: ArrayLike) -> Array:
     """Evaluate FLSS, with the heights scaled by each of (m,) factors: (m, n, 3); other arguments as `linear_rgb`."""
-    terms = {"terms": _TERMS[method]} if method in _TERMS else {}
-    shader = shader_for(height_field, "flss", _QUIRKS[method], coherence_length=_COHERENCE_LENGTH, **terms)
+    shader = shader_for(height_field, "flss", _QUIRKS[method], coherence_length=_COHERENCE_LENGTH)
     wo = np.asarray(wo, np.float32)
     wi = vectors(np.broadcast_to(np.float32(_LIGHT), wo.shape))
     weights = shader.weights()
@@ -231,12 +226,11 @@ def agreement(pixels: Grid, linear: Array, encoding: str = "sRGB") -> Agreement:
     return Agreement(float(correlation), brightness)
 
 
-def correlation_against_height(published: PublishedMap, method: str, heights: ArrayLike) -> Array:
-    """Correlate FLSS with every 16th pixel of the author's map for each height range of the surface.
+def correlation_against_height(published: PublishedMap, heights: ArrayLike) -> Array:
+    """Correlate FLSS as published with every 16th pixel of the author's map for each height range of the surface.
 
     Args:
         published: the map.
-        method: `PUBLISHED` or `TRUNCATED`.
         heights: (n,) height ranges in µm.
 
     Returns:
@@ -244,7 +238,7 @@ def correlation_against_height(published: PublishedMap, method: str, heights: Ar
     """
     pixels = grid(published, 16)
     scales = np.asarray(heights, np.float64) / published.height
-    maps = shader_rgb(published.recipe.height_field(), method, pixels.wo, scales)
+    maps = shader_rgb(published.recipe.height_field(), PUBLISHED, pixels.wo, scales)
     return np.array([agreement(pixels, linear).correlation for linear in maps])
 
 
@@ -253,7 +247,6 @@ def correlation_against_height(published: PublishedMap, method: str, heights: Ar
 FILES = ("published_maps.png", "published_maps.md", "published_heights.png")
 COLUMNS = ("map", "method", *(f"correlation, {encoding}" for encoding in ENCODINGS))
 _TITLES = {PUBLISHED: "FLSS as published", CORRECTED: "FLSS corrected", MODEL: "this model"}
-_SERIES = {PUBLISHED: "series converged", TRUNCATED: "37 terms from the lowest point"}
 _HEIGHTS = np.arange(0.30, 0.92, 0.05)  # µm
 
 
@@ -305,14 +298,13 @@ def table(rows: Iterable[Row]) -> list[list[str]]:
     ]
 
 
-def plot_heights(curves: Mapping[str, Mapping[str, Array]]) -> Figure:
-    """Plot correlation against height range, a panel for each surface: name → method → (n,) at the heights."""
+def plot_heights(curves: Mapping[str, Array]) -> Figure:
+    """Plot correlation against height range, a panel for each surface: name → (n,) at the heights."""
     drawn = figure(4.2 * len(curves), 3.6)
     axes = drawn.subplots(1, len(curves), sharey=True, squeeze=False)[0]
-    for panel, (name, of_methods) in zip(axes, curves.items(), strict=True):
+    for panel, (name, values) in zip(axes, curves.items(), strict=True):
         published = PUBLISHED_MAPS[name]
-        for method, values in of_methods.items():
-            panel.plot(_HEIGHTS, values, marker="o", markersize=4, label=_SERIES[method])
+        panel.plot(_HEIGHTS, values, marker="o", markersize=4, label="FLSS as published")
         panel.axvline(published.height, color="0.4", linestyle="--", linewidth=1, label="height in the maps")
         panel.set_title(published.name, fontsize=11)
         panel.set_xlabel("height, black to white / µm")
@@ -345,12 +337,9 @@ def save_published(
     for name in PUBLISHED_MAPS:
         rows.append(row(name, step))
         progress(len(rows), total)
-    curves: dict[str, dict[str, Array]] = {}
+    curves: dict[str, Array] = {}
     for name in skins:
-        curves[name] = {
-            method: correlation_against_height(PUBLISHED_MAPS[name], method, _HEIGHTS)
-            for method in (PUBLISHED, TRUNCATED)
-        }
+        curves[name] = correlation_against_height(PUBLISHED_MAPS[name], _HEIGHTS)
         progress(len(rows) + len(curves), total)
     for name, drawn in (("published_maps.png", plot_maps(rows)), ("published_heights.png", plot_heights(curves))):
         with whole_file(folder / name) as temporary:

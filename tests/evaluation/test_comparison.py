@@ -153,7 +153,8 @@ def test_each_shader_names_the_quirks_that_change_it(kind):
         for name in Quirks.names()
         if not np.allclose(colours(replace(Quirks.corrected(), **{name: True})), plain, rtol=1e-4, atol=1e-6)
     ]
-    assert set(changing) == set(VARIANTS[kind].own_quirks)
+    # The number of terms is given here.
+    assert set(changing) == set(VARIANTS[kind].own_quirks) - {"fixed_terms"}
 
 
 @pytest.mark.parametrize("kind", VARIANTS)
@@ -175,11 +176,12 @@ def test_a_shader_with_changed_quirks_is_that_made_anew(kind):
 @pytest.mark.slow
 @pytest.mark.parametrize("rfilter", ["gaussian", "box"])
 def test_the_integrator_converges_to_the_shader(llvm, tmp_path, rfilter):
-    pictures = Pictures(write(tmp_path / "scene.xml", rfilter=rfilter), "gem")
-    for quirks in (("power_gamma", "constant_blend", "infrared_rainbow", NO_SHADOWS), ()):
+    pictures = Pictures(write(tmp_path / "scene.xml", rfilter=rfilter), "gem", brightness=3000)
+    for quirks in (("constant_blend", NO_SHADOWS), ()):
         found = pictures.shaded(quirks, 64, 256)
         switches = {name: name in quirks for name in Quirks.names()}
         parameters = {"type": "diffraction_shader", "variant": "gem", "shadows": NO_SHADOWS not in quirks, **switches}
+        parameters["brightness"] = found.brightness
         expected = to_xyz(mi.render(pictures.scene, integrator=mi.load_dict(parameters), spp=1024, seed=3))
         assert np.abs(found.xyz - expected).sum() < 0.03 * expected.sum()
         np.testing.assert_allclose(found.xyz.sum((0, 1)), expected.sum((0, 1)), rtol=0.01)
@@ -244,14 +246,39 @@ def test_corrected_the_shader_agrees_with_the_model_on_a_snake(llvm, snake):
     assert published > 10 * corrected
 
 
-def test_only_pixels_covered_by_surfaces_are_compared(llvm, tmp_path):
-    pictures = Pictures(write(tmp_path / "scene.xml", shapes=SPHERE), "gem", width=64)
+def test_only_pixels_covered_by_gratings_are_compared(llvm, tmp_path):
+    plate = PLATE.replace("{}", '<bsdf type="diffuse"/>')
+    pictures = Pictures(write(tmp_path / "scene.xml", shapes=SPHERE + plate), "gem", width=64)
     rows, columns = pictures.surface.shape
     assert (rows, columns) == (48, 64)
     # The disc of a sphere at the distance √(6² + 3.8²), seen through 35° over 64 pixels, less its rim.
     radius = np.tan(np.arcsin(1 / np.hypot(6, 3.8))) / np.tan(np.deg2rad(17.5)) * 32
     disc = np.pi * radius**2
     assert disc - 2 * np.pi * radius < pictures.surface.sum() < disc
+
+
+@pytest.mark.few(2)
+@pytest.mark.parametrize("pigment", [False, True])
+def test_brightness_is_fitted_to_the_diffraction_of_this_model(llvm, tmp_path, pigment):
+    pictures = Pictures(write(tmp_path / "scene.xml"), "gem", width=8, pigment=pigment)
+    assert pictures.has_base == pigment
+    found, model = pictures.shaded((NO_SHADOWS,), 16, 64), pictures.same_light(16, 64)
+    assert model.brightness is None
+
+    def diffraction(picture):
+        # The base of the same scene, without noise of its own: the light of BSDFs other than gratings is the same.
+        below = Pictures(tmp_path / "scene.xml", "gem", width=8, pigment=pigment, brightness=1e-9)
+        rest = below.shaded(((NO_SHADOWS,) if picture is found else ()), 16, 64)
+        return (picture.xyz - rest.xyz)[pictures.surface][:, 1].mean()
+
+    assert diffraction(found) == pytest.approx(diffraction(model), rel=1e-3)
+    if not pigment:
+        assert diffraction(found) == pytest.approx(found.xyz[pictures.surface][:, 1].mean(), rel=1e-5)
+    # The number is that of the integrator, and a given one is kept.
+    given = Pictures(tmp_path / "scene.xml", "gem", width=8, pigment=pigment, brightness=found.brightness)
+    again = given.shaded((NO_SHADOWS,), 16, 64)
+    assert again.brightness == found.brightness
+    np.testing.assert_allclose(again.xyz, found.xyz, rtol=1e-4, atol=1e-6 * found.xyz.max())
 
 
 def test_a_crop_window_is_compared_alone(llvm, tmp_path):
@@ -270,28 +297,26 @@ def test_a_crop_window_is_compared_alone(llvm, tmp_path):
 @pytest.mark.slow
 def test_the_share_of_a_quirk_is_that_of_renderings_without_it(llvm, tmp_path):
     pictures = Pictures(write(tmp_path / "scene.xml", SUN + SKY), "gem", width=8)
-    names = ("constant_blend", "infrared_rainbow", "power_gamma", NO_SHADOWS)
+    names = ("constant_blend", NO_SHADOWS)
     assert sorted(pictures.quirks) == sorted(names)
     steps = []
     found = quirk_shares(pictures, 16, 4, lambda done, total: steps.append((done, total)))
-    assert steps == [(i + 1, 12) for i in range(12)]
+    assert steps == [(i + 1, 7) for i in range(7)]
     assert found.size == (8, 6)
-    white = white_luminance(pictures.path_traced(16).xyz, pictures.surface)
-    against, reference = found.same_light, pictures.same_light(4, 16)
+    reference = pictures.same_light(4, 16)
+    white = white_luminance(reference.xyz, pictures.surface)
 
     def mean(*quirks):
         return difference(reference.xyz, pictures.shaded(quirks, 4, 16).xyz, pictures.surface, white).mean
 
-    assert against.published == pytest.approx(mean(*names))
-    assert against.corrected == pytest.approx(mean())
-    one = against.quirks["power_gamma"]
-    assert one.drop == pytest.approx(mean(*names) - mean("constant_blend", "infrared_rainbow", NO_SHADOWS))
-    assert one.rise == pytest.approx(mean("power_gamma") - mean())
+    assert found.published == pytest.approx(mean(*names))
+    assert found.corrected == pytest.approx(mean())
+    one = found.quirks["constant_blend"]
+    assert one.drop == pytest.approx(mean(*names) - mean(NO_SHADOWS))
+    assert one.rise == pytest.approx(mean("constant_blend") - mean())
     assert one.share == pytest.approx((one.drop + one.rise) / 2 / mean(*names))
-    # The sky is none of the shader's.
-    assert found.path_traced.corrected > against.corrected
     # The sphere casts a shadow on the plate.
-    shadow = found.same_light.quirks[NO_SHADOWS]
+    shadow = found.quirks[NO_SHADOWS]
     assert shadow.rise == pytest.approx(mean(NO_SHADOWS) - mean())
     assert shadow.rise > 0
 
@@ -332,19 +357,22 @@ def test_compare_writes_pictures_numbers_and_a_figure(command, llvm, folder):
     assert f"{found['exposure']:.3g}" in out
     assert 0 < found["mean"] <= found["percentile_95"] <= found["max"]
     assert numbers["shares"]["size"] == [12, 9]
-    for reference in ("path_traced", "same_light"):
-        assert {*numbers["shares"][reference]["quirks"]["power_gamma"]} == {"drop", "rise", "share"}
-    for name in ("constant_blend", "infrared_rainbow", "power_gamma", NO_SHADOWS):
-        assert name in out
+    assert {*numbers["shares"]["quirks"][NO_SHADOWS]} == {"drop", "rise", "share"}
+    assert NO_SHADOWS in out
+    assert "constant_blend" not in out  # nothing is blended without pigment
+    brightness = numbers["pictures"]["published"]["brightness"]
+    assert f" {brightness:.3g} " in out
+    assert numbers["published_brightness"] == 1000
+    assert numbers["pictures"]["same_light"]["brightness"] is None
     few = numbers["few_samples"]
     assert [samples for samples, _, _ in few] == [1, 4]
     assert few[0][2] > few[1][2]
     assert "seconds of path tracer: " in out
-    assert re.search(r"\n\s*\n\s*path tracer +same light", out)  # a line between the tables
+    assert re.search(r"\n\s*\nquirk +cause", out)  # a line between the tables
     # The pictures are those of the numbers.
     path, published = (md.render.SpectralImage.load(f"scene-gem-{name}.exr") for name in ("path", "published"))
     xyz = [spectrum_to_XYZ(image.radiance, image.wavelengths) for image in (path, published)]
-    surface = Pictures("scene.xml", "gem", width=12).surface
+    surface = Pictures("scene.xml", "gem", width=12, pigment=False).surface
     again = difference(*xyz, surface, numbers["white"])
     assert again.mean == pytest.approx(found["mean"], rel=1e-3)
     with Image.open("scene-gem.png") as picture:
@@ -426,6 +454,9 @@ def test_a_recipe_is_compared_on_the_objects_of_a_scene(command, llvm, folder):
         ("gone.xml", {}, "gone.xml"),
         ("scene.xml --shader flsss", {}, "shader: got 'flsss', wanted one of flss, nmm, pq, nmm_pq, gem"),
         ("scene.xml --interpolation linear", {}, "interpolation: got 'linear', which flss cannot use"),
+        ("scene.xml --brightness -1", {}, "brightness: got -1.0, wanted a finite number that is not negative"),
+        ("scene.xml --brightness nan", {}, "brightness: got nan, wanted a finite number that is not negative"),
+        ("scene.xml --brightness bright", {}, "--brightness: got 'bright', wanted auto or a number"),
         ("scene.xml --window wide", {}, "window: got 'wide', wanted one of texel, 4sigma"),
         ("scene.xml -o nowhere/out", {}, "the folder nowhere is not there"),
         ("scene.xml --json nowhere/out.json", {}, "the folder nowhere is not there"),

@@ -13,6 +13,7 @@ from mitsuba_diffraction import testing
 from mitsuba_diffraction.bsdf.geometry import rotated
 from mitsuba_diffraction.color import delta_E, spectrum_to_XYZ
 from mitsuba_diffraction.evaluation.realtime_shader.evaluate import VARIANTS, shader_for
+from mitsuba_diffraction.evaluation.realtime_shader.integrator import PUBLISHED_BRIGHTNESS
 from mitsuba_diffraction.evaluation.realtime_shader.quirks import Quirks
 from mitsuba_diffraction.render import render
 from mitsuba_diffraction.viewer import page as pages
@@ -155,7 +156,7 @@ def test_colours_are_integrals_over_the_wavelength(source, changes, opened):
 )
 @pytest.mark.parametrize("source", ["blaze.toml", pytest.param("elaphe_afm.toml", marks=pytest.mark.slow)])
 def test_colours_are_those_of_the_shader_of_2014(source, published, opened, llvm):
-    """All variants in linear RGB, to 1e-3 of the largest value; gamma and blend are not part of it."""
+    """All variants in linear RGB, to 1e-3 of the largest value; the blend is not part of it."""
     surface = Surface.named(RECIPES / source, {})
     pairs = pairs_of(surface.spectrum, 1000)
     tab = opened(surface)
@@ -163,7 +164,8 @@ def test_colours_are_those_of_the_shader_of_2014(source, published, opened, llvm
     quirks = Quirks.as_published() if published else Quirks.corrected()
     field, light = surface.recipe.height_field(), pages._light()[20:421, 3]
     # The page has no other light than D65.
-    assert {*tab.evaluate("viewer.state.quirks"), "d65_light"} == set(Quirks.names())
+    assert {*tab.evaluate("viewer.state.quirks"), "d65_light", "fixed_terms"} == set(Quirks.names())
+    assert tab.evaluate("viewer.state.brightness") == PUBLISHED_BRIGHTNESS
     for variant in VARIANTS:
         # Fewer terms, whose differences in the order of summation do not grow.
         settings = {"corrected_coherence_length": surface.spectrum.coherence_length, "exact_fresnel": True, "terms": 25}
@@ -171,7 +173,10 @@ def test_colours_are_those_of_the_shader_of_2014(source, published, opened, llvm
         shader = shader_for(field, variant, quirks, **({} if variant == "gem" else settings))
         wi, wo = testing.vectors(pairs[:, :3]), testing.vectors(pairs[:, 3:6])
         wanted = testing.array(shader.rgb(wi, wo, shader.weights(light=light)), np.float64).T
-        tab.evaluate(f"viewer.set({{ right: '{variant}', terms: 25, quirks: {str(vars(quirks)).lower()} }})")
+        if shader.has_free_scale:
+            wanted *= 300 * shader.brightness_unit
+        state = f"right: '{variant}', terms: 25, brightness: 300, quirks: {str(vars(quirks)).lower()}"
+        tab.evaluate(f"viewer.set({{ {state} }})")
         found = call(tab, "viewer.evaluateShader", pairs.ravel().tolist()).reshape(-1, 4)[:, :3]
         assert (np.abs(wanted).max(axis=1) > 1e-3 * wanted.max()).mean() > 0.05, variant
         np.testing.assert_allclose(found, wanted, rtol=0, atol=1e-3 * np.abs(wanted).max(), err_msg=variant)
@@ -198,6 +203,19 @@ def test_a_drag_changes_the_picture_and_nothing_leaves_the_page(opened):
     tab.keyboard.up("Shift")
     assert len(set(pictures)) == 3
     assert tab.messages == [tab.url[:80]]
+
+
+def test_a_slider_sets_the_brightness_of_the_shader(opened):
+    tab = opened(Surface.named("blazed", {"depth": 0.1, "samples": 64, "coherence_length": 3.0}))
+    tab.evaluate("viewer.set({ maxFrames: 1, right: 'flss' })")
+    slider = tab.locator("#brightness")
+    assert np.exp(float(slider.input_value())) == pytest.approx(PUBLISHED_BRIGHTNESS, rel=1e-3)
+    slider.evaluate("(input) => { input.value = Math.log(50); input.dispatchEvent(new Event('input')); }")
+    assert tab.evaluate("viewer.state.brightness") == pytest.approx(50, rel=1e-3)
+    assert tab.locator("#brightness-shown").inner_text() == "50.0"
+    # Radiance in the scene's units has no free scale.
+    tab.evaluate("viewer.set({ quirks: { ...viewer.state.quirks, relative: false } })")
+    assert slider.is_disabled()
 
 
 def test_a_pixel_has_the_orders_of_the_grating_equation(opened):

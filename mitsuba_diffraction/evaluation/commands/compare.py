@@ -11,6 +11,7 @@ import typer
 
 from ...cli.arguments import Define, Overwrite, Variant, check_suffix, scene_parameters
 from ...cli.examples import source as examples_folder
+from ...errors import RequestError
 from ...files import whole_file
 from ...outputs import check_outputs, free_name, save_json
 from ...progress import progress_bar, say, show, tell
@@ -34,6 +35,10 @@ def compare(
     terms: Annotated[int | None, typer.Option(min=1, help="number of Taylor terms of the shader")] = None,
     window: Annotated[str | None, typer.Option(help="texel or 4sigma; of flss and nmm")] = None,
     interpolation: Annotated[str | None, typer.Option(help="sinc or linear; of pq and nmm_pq")] = None,
+    brightness: Annotated[
+        str, typer.Option(help="of the shader's diffraction: a number, 1000 in the published program; auto fits it")
+    ] = "auto",
+    pigment: Annotated[bool, typer.Option("--pigment", help="add what lies below gratings to all pictures")] = False,
     spp: Annotated[int, typer.Option(min=1, help="samples per pixel of the path tracer")] = 64,
     shading_points: Annotated[int, typer.Option(min=1, help="shading points per pixel of the shader")] = 4,
     width: Annotated[int | None, typer.Option(min=1, help="pixels; default: that of the scene")] = None,
@@ -57,7 +62,9 @@ def compare(
     from ..comparison import compare as run
     from ..comparison import summary
     from ..comparison.pictures import supported_lights
+    from ..realtime_shader.integrator import checked_brightness
 
+    number = None if brightness == "auto" else checked_brightness(_number(brightness))
     parameters, name = scene_parameters(define), scene.stem
     shader, *others = shader or ["flss"]
     if scene.suffix.lower() == ".toml":
@@ -86,6 +93,8 @@ def compare(
         terms=terms,
         window=window,
         interpolation=interpolation,
+        brightness=number,
+        pigment=pigment,
         width=width,
         height=height,
         spp=spp,
@@ -105,3 +114,10 @@ def compare(
     show(summary.picture_table(found), *of_quirks, width=120)
     tell("\n" + "\n".join(summary.notes(found)))
     tell(f"{', '.join(str(target) for _, target in written)}: {found.variant}, {time.perf_counter() - start:.1f} s")
+
+
+def _number(text: str) -> float:
+    try:
+        return float(text)
+    except ValueError:
+        raise RequestError(f"--brightness: got {text!r}, wanted auto or a number") from None

@@ -20,10 +20,10 @@ from .difference import Difference, difference, noise, time_of_error, white_lumi
 from .pictures import Picture, Pictures
 from .quirk_shares import QuirkShares, quirk_shares
 
-# The effect of quirks is measured in small pictures with little noise: 28 of them take about a minute on two cores.
-QUIRKS_MAX_SIDE = 96
-QUIRKS_SAMPLES = 256
-QUIRKS_SHADING_POINTS = 9
+# The effect of quirks is measured in small pictures with little noise: 25 take about a minute on two cores.
+QUIRKS_MAX_SIDE = 72
+QUIRKS_SAMPLES = 64
+QUIRKS_SHADING_POINTS = 4
 
 FEW_SAMPLES = (1, 4, 16, 64)
 """Per pixel of the pictures by which the path tracer's time for an error is measured."""
@@ -43,7 +43,8 @@ class Comparison:
         pictures: by name: "path_traced", "same_light" (the project's model under the lights that the shader supports),
             "published" and "corrected" (the shader with and without its quirks), and for each of `others`, such as nmm,
             "nmm_published" and "nmm_corrected".
-        surface: (height, width) bool, the pixels that are compared: those covered by surfaces.
+        pigment: whether what lies below the gratings is shown, in all pictures alike.
+        surface: (height, width) bool, the pixels that are compared: those covered by gratings.
         white: the luminance that is shown as white.
         to_path_traced: difference of each other picture from the path-traced one.
         to_same_light: difference of the shader's pictures from "same_light", at the same points.
@@ -67,6 +68,7 @@ class Comparison:
     variant: str
     seed: int
     pictures: Mapping[str, Picture]
+    pigment: bool
     surface: NDArray[np.bool_]
     white: float
     to_path_traced: Mapping[str, Difference]
@@ -96,6 +98,8 @@ def compare(
     terms: int | None = None,
     window: str | None = None,
     interpolation: str | None = None,
+    brightness: float | None = None,
+    pigment: bool = False,
     width: int | None = None,
     height: int | None = None,
     spp: int = 64,
@@ -115,6 +119,9 @@ def compare(
         terms: number of Taylor terms; default: as published, or, corrected, as many as needed.
         window: "texel" or "4sigma" (flss, nmm); default: as published "texel", corrected "4sigma".
         interpolation: "sinc" or "linear" (pq, nmm_pq).
+        brightness: of the shader, 1000 in the published program; default: of each picture the one with which its
+            diffraction has the mean luminance of this model's in the same light.
+        pigment: show what lies below the gratings; the published pictures show diffraction alone.
         width: in pixels; default: that of the film.
         height: likewise.
         spp: samples per pixel of the path tracer.
@@ -142,6 +149,7 @@ def compare(
         if not any(name in settings_of(kind) for kind in (shader, *others)):
             raise RequestError(f"{name}: got {settings[name]!r}, which {', '.join((shader, *others))} cannot use")
     request = {"seed": seed, "parameters": parameters, "settings": settings}
+    request |= {"brightness": brightness, "pigment": pigment}
     of = Pictures(scene_path, shader, width=width, height=height, **request)
     for other in others:
         of.use(other)  # refuses a scene that it cannot show
@@ -180,6 +188,7 @@ def compare(
         variant=mi.variant(),
         seed=seed,
         pictures=pictures,
+        pigment=pigment,
         surface=of.surface,
         white=white,
         to_path_traced={

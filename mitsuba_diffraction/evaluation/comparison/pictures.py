@@ -25,10 +25,10 @@ from ...settings import VISIBLE
 from ..realtime_shader import tristimulus
 from ..realtime_shader.base import Shader, TextureShader
 from ..realtime_shader.flss import FLSS
-from ..realtime_shader.integrator import settings_of
+from ..realtime_shader.integrator import PUBLISHED_BRIGHTNESS, checked_brightness, settings_of
 from ..realtime_shader.lights import lights_of
 from ..realtime_shader.quirks import Quirks
-from ..realtime_shader.surfaces import sum_along
+from ..realtime_shader.surfaces import gratings_of, sum_along
 from ..realtime_shader.tristimulus import EMISSION, primary_spectra
 
 
@@ -87,6 +87,8 @@ def without_gratings(shader: mi.SamplingIntegrator) -> mi.SamplingIntegrator:
 
 NO_SHADOWS = "no_shadows"
 
+LUMINANCE = (0.2126, 0.7152, 0.0722)  # of linear sRGB (IEC 61966-2-1)
+
 # Some seconds of work on two cores, so that progress is shown.
 _MAX_POINTS_PER_DISPATCH = 2**16
 
@@ -102,6 +104,7 @@ class Picture:
         image: spectral radiance.
         samples: per pixel.
         seconds: of rendering, without loading the scene and compiling kernels.
+        brightness: of the shader; None where there is no free scale.
         halves: XYZ (2, height, width, 3) of two independent pictures with half of the samples each; None for a
             picture with an odd number of samples.
         xyz: (height, width, 3), CIE XYZ as `color` scales it.
@@ -110,6 +113,7 @@ class Picture:
     image: SpectralImage
     samples: int
     seconds: float
+    brightness: float | None = None
     halves: NDArray[np.float64] | None = None
     xyz: NDArray[np.float64] = field(init=False)
 
@@ -123,7 +127,7 @@ class Pictures:
     Attributes:
         scene: Mitsuba's.
         film_size: (width, height) of the whole film; a picture shows its crop window.
-        surface: (height, width) bool, the pixels covered by surfaces.
+        surface: (height, width) bool, the pixels covered by gratings.
         shaders: of the gratings.
         spectra: of the gratings.
         has_base: whether something lies below a grating.
@@ -142,6 +146,8 @@ class Pictures:
         seed: int = 0,
         parameters: Mapping[str, str] | None = None,
         settings: Mapping[str, object] | None = None,
+        brightness: float | None = None,
+        pigment: bool = True,
     ) -> None:
         """Load the scene; see `load_spectral_scene`.
 
@@ -153,12 +159,17 @@ class Pictures:
             seed: of the random numbers, not negative.
             parameters: values for the scene's `$name` parameters.
             settings: further parameters of the `diffraction_shader`: terms, window, interpolation.
+            brightness: of the shader; default: the one with which the diffraction of each of its pictures has the mean
+                luminance of that of `same_light`.
+            pigment: show what lies below the gratings, too.
 
         Raises:
             FileNotFoundError: if there is no such scene.
             ValueError: if the request is wrong, or the shader cannot show the scene.
         """
         self._settings = settings or {}
+        self._brightness = None if brightness is None else checked_brightness(brightness)
+        self._luminance: float | None = None  # of the diffraction in `same_light`, mean over the gratings
         if seed < 0:
             raise RequestError(f"seed: got {seed}, wanted an integer that is not negative")
         _check_lights(Path(scene_path), parameters)
@@ -167,22 +178,28 @@ class Pictures:
             raise RequestError(f"{scene_path}: its integrator is the shader itself, wanted a path tracer (type='path')")
         if (found := recorded_range(self.scene)) != VISIBLE:
             raise RequestError(f"{scene_path}: got a film of {found[0]:g} to {found[1]:g} nm, wanted visible light")
+        gratings, outer = gratings_of(self.scene)
+        if not gratings:
+            raise RequestError("no shape has a diffraction_grating, there is nothing to compare")
+        if not pigment:
+            for bsdf in gratings:
+                bsdf.layers.base = None
         self.seed = seed
         self._others: dict[tuple[bool, bool, int], Picture] = {}
         self.use(shader)
         self.film_size = tuple(int(size) for size in self.scene.sensors()[0].film().size())
-        self.surface = _shows_surfaces(self.scene)
+        self.surface = _shows_gratings(self.scene, outer)
         if not self.surface.any():
-            raise RequestError(f"{scene_path}: no pixel shows a surface, there is nothing to compare")
+            raise RequestError(f"{scene_path}: no pixel shows only a grating, there is nothing to compare")
 
     def use(self, shader: str) -> None:
         """Choose the shader, one of `VARIANTS`, of the next pictures."""
         own = {name: value for name, value in self._settings.items() if name in settings_of(shader)}
-        self._shader = mi.load_dict({"type": "diffraction_shader", "variant": shader, **own})
+        brightness = self._brightness or PUBLISHED_BRIGHTNESS
+        request = {"type": "diffraction_shader", "variant": shader, "brightness": brightness, **own}
+        self._shader = mi.load_dict(request)
         # Refuses a scene that the shader cannot show.
         self._shader.prepare(self.scene)
-        if not self._shader.shaded:
-            raise RequestError("no shape has a diffraction_grating, there is nothing to compare")
         self.shaders: list[Shader] = [shaded.shader for shaded in self._shader.shaded]
         layers = [shaded.layers for shaded in self._shader.shaded]
         self.spectra = [one.grating.spectrum for one in layers]
@@ -195,8 +212,7 @@ class Pictures:
     @property
     def quirks(self) -> tuple[str, ...]:
         """Names of the `Quirks` that affect this scene with this shader, and "no_shadows"."""
-        of_integrator = ("power_gamma", *(("constant_blend",) if self.has_base else ()))
-        own = {*self.shaders[0].own_quirks, *of_integrator}
+        own = {*self.shaders[0].own_quirks, *(("constant_blend",) if self.has_base else ())}
         textures = [shader for shader in self.shaders if isinstance(shader, TextureShader)]
         if all(shader.extent == "tile" for shader in textures):
             own -= {"periodic_scan"}
@@ -251,7 +267,8 @@ class Pictures:
                 dr.eval(rgb)
             return rgb
 
-        return self._at_points(colour, samples, others, progress)
+        picture, self._luminance = self._at_points(colour, samples, others, progress)
+        return picture
 
     def shaded(self, quirks: Collection[str], samples: int, others: int, progress: Progress = silent) -> Picture:
         """Render what the shader's integrator converges to, with far fewer samples.
@@ -267,7 +284,18 @@ class Pictures:
             progress: called with (done, total).
         """
         self._choose(quirks)
-        return self._at_points(lambda ray: self._shader.shade(self.scene, ray)[0], samples, others, progress)
+        has_free_scale = any(shader.has_free_scale for shader in self.shaders)
+        is_fitted = has_free_scale and self._brightness is None
+        if is_fitted and self._luminance is None:
+            self.same_light(samples, others)
+            self._choose(quirks)
+        picture, _ = self._at_points(
+            lambda ray: self._shader.shade(self.scene, ray)[0],
+            *(samples, others, progress),
+            brightness=self._shader.brightness if has_free_scale else None,
+            luminance=self._luminance if is_fitted else None,
+        )
+        return picture
 
     def _choose(self, quirks: Collection[str]) -> None:
         self._shader.set_quirks(Quirks(**{name: name in quirks for name in Quirks.names()}))
@@ -275,8 +303,28 @@ class Pictures:
         self._shader.prepare(self.scene)
         self.shaders = [shaded.shader for shaded in self._shader.shaded]
 
-    def _at_points(self, colour: Colour, samples: int, others: int, progress: Progress) -> Picture:
-        """Add the colours of gratings at points of the pixels to the light of all other BSDFs."""
+    def _at_points(
+        self,
+        colour: Colour,
+        samples: int,
+        others: int,
+        progress: Progress,
+        brightness: float | None = None,
+        luminance: float | None = None,
+    ) -> tuple[Picture, float]:
+        """Add the colours of gratings at points of the pixels to the light of all other BSDFs.
+
+        Args:
+            colour: of the gratings.
+            samples: points per pixel.
+            others: samples per pixel of all other BSDFs.
+            progress: called with (done, total).
+            brightness: of the colours; None where there is no free scale.
+            luminance: scales the colours, and their brightness, to this mean over the gratings; default: as they are.
+
+        Returns:
+            The picture, and the mean luminance of the colours over the gratings.
+        """
         known = (self._shader.quirks.constant_blend, self._shader.shadows, others)
         if known not in self._others:
             self._others[known] = self._traced(without_gratings(self._shader), others, silent, halves=False)
@@ -287,11 +335,17 @@ class Pictures:
             self._colours(colour, count, index, part(progress, index / len(counts), (index + 1) / len(counts)))
             for index, count in enumerate(counts)
         ]
-        radiance = [rest.image.radiance + rgb @ _channel_spectra().T for rgb, _ in parts]
+        mean = float(np.mean([rgb[self.surface] @ LUMINANCE for rgb, _ in parts]))
+        if luminance is not None and not mean > 0:
+            raise RequestError(f"brightness: got diffraction of the mean luminance {mean:.3g}, wanted a positive one")
+        scale = 1.0 if luminance is None else luminance / mean
+        radiance = [rest.image.radiance + scale * rgb @ _channel_spectra().T for rgb, _ in parts]
         wavelengths = rest.image.wavelengths
         halves = np.array([spectrum_to_XYZ(half, wavelengths) for half in radiance]) if len(parts) > 1 else None
         seconds = rest.seconds + sum(seconds for _, seconds in parts)
-        return Picture(SpectralImage(wavelengths, np.mean(radiance, axis=0)), samples, seconds, halves)
+        image = SpectralImage(wavelengths, np.mean(radiance, axis=0))
+        brightness = None if brightness is None else scale * brightness
+        return Picture(image, samples, seconds, brightness, halves), scale * mean
 
     def _traced(
         self,
@@ -318,7 +372,7 @@ class Pictures:
         seconds = time.perf_counter() - begin
         image = SpectralImage(channel_wavelengths(), sums.radiance())
         in_halves = ratio(pair[..., :3], pair[..., 3:]) if halves and len(passes) > 1 else None
-        return Picture(image, sums.samples, seconds, in_halves)
+        return Picture(image, sums.samples, seconds, halves=in_halves)
 
     def _colours(
         self, colour: Colour, samples: int, half: int, progress: Progress
@@ -412,7 +466,7 @@ def _wavelengths_of_the_shader() -> Iterator[tuple[mi.UnpolarizedSpectrum, list[
     """Return the shader's wavelengths, as many at a time as a ray has, and their weights in linear sRGB."""
     step = int(tristimulus.WAVELENGTH_STEP)
     to_xyz = step * tristimulus.light_weights(np.ones_like(tristimulus.wavelengths()))
-    to_rgb = to_xyz @ tristimulus.rgb_matrix(cie_rgb_matrix=False, d65_twice=False).T
+    to_rgb = to_xyz @ tristimulus.rgb_matrix(cie_rgb_matrix=False).T
     columns = np.column_stack([tristimulus.wavelengths(), to_rgb])[::step]
     count = len(mi.UnpolarizedSpectrum(0))
     # The last ones are repeated without weight.
@@ -423,12 +477,16 @@ def _wavelengths_of_the_shader() -> Iterator[tuple[mi.UnpolarizedSpectrum, list[
         yield spectra[0], spectra[1:]
 
 
-def _shows_surfaces(scene: mi.Scene) -> NDArray[np.bool_]:
-    """Return a mask of the pixels in which all of 4 × 4 rays hit a surface, (height, width)."""
+def _shows_gratings(scene: mi.Scene, outer: list[mi.BSDF]) -> NDArray[np.bool_]:
+    """Return a mask of the pixels in which all of 4 × 4 rays hit one of some BSDFs, (height, width)."""
     sensor = scene.sensors()[0]
     columns, rows = sensor.film().crop_size()
     y, x = (np.mgrid[: 4 * rows, : 4 * columns].reshape(2, -1) + 0.5) / np.array([[4 * rows], [4 * columns]])
     position = mi.Point2f(x.astype(np.float32), y.astype(np.float32))
     ray, _ = sensor.sample_ray(0.0, 0.5, position, mi.Point2f(0.5))
-    hit = np.array(scene.ray_test(ray)).reshape(rows, 4, columns, 4)
+    si = scene.ray_intersect(ray)
+    of_grating = mi.Bool(False)
+    for bsdf in outer:
+        of_grating |= si.bsdf() == mi.BSDFPtr(bsdf)
+    hit = np.array(si.is_valid() & of_grating).reshape(rows, 4, columns, 4)
     return hit.all(axis=(1, 3))

@@ -15,12 +15,33 @@ from ...files import whole_file
 from ...outputs import METADATA
 from ...progress import table
 from .. import report
+from ..realtime_shader.integrator import PUBLISHED_BRIGHTNESS
 from .comparison import Comparison
-from .quirk_shares import AgainstReference
+from .pictures import NO_SHADOWS
+from .quirk_shares import MIN_EFFECT, QuirkShares
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
+
+CAUSES = {
+    "schlick": "Schlick's Fresnel",
+    "fixed_index": "index of 1.5",
+    "complex_window_sum": "speckle of one point",
+    "one_texel": "3 × 3 texels",
+    "floor_anchor": "window off centre",
+    "fixed_coherence": "coherence of 65 µm",
+    "periodic_scan": "seams of the scan",
+    "fixed_terms": "number of Taylor terms",
+    "no_jacobian": "no dλ/dn",
+    "wrong_product": "wrong product",
+    "d65_light": "D65 as light",
+    "relative": "no 1/λ²",
+    "cie_rgb_matrix": "CIE RGB for sRGB",
+    "constant_blend": "constant blend",
+    NO_SHADOWS: "no cast shadows",
+}
+"""The quirks in words."""
 
 
 def titles(comparison: Comparison) -> dict[str, str]:
@@ -37,7 +58,6 @@ _TO_REFERENCE = {
     "exposure\nfactor": "{.exposure:.3g}",
     "ΔE00\nmean": "{.mean:.2f}",
     "ΔE00\n95 %": "{.percentile_95:.1f}",
-    "ΔE00\nmax": "{.max:.1f}",
     "luminance\nerror": "{.luminance_error:.1%}",
 }
 
@@ -45,6 +65,7 @@ _TO_REFERENCE = {
 def picture_table(comparison: Comparison) -> Table:
     """Return a table of the pictures and their differences, for a terminal."""
     columns = (
+        "bright-\nness",
         *_TO_REFERENCE,
         "ΔE00 to\nsame light",
         "reads per\npoint",
@@ -57,46 +78,35 @@ def picture_table(comparison: Comparison) -> Table:
         found, same = comparison.to_path_traced.get(name), comparison.to_same_light.get(name)
         picture = comparison.pictures[name]
         reads = comparison.shader_reads.get(name, comparison.model_reads)
-        differences = ["1", "", "", "", ""] if found is None else report.cells(_TO_REFERENCE, found)
+        differences = ["1", "", "", ""] if found is None else report.cells(_TO_REFERENCE, found)
+        brightness = "" if picture.brightness is None else f"{picture.brightness:.3g}"
         same_light = "" if same is None else f"{same.mean:.2f}"
         time = float("nan") if found is None else comparison.time_of_error(name)
         bound = "< " if comparison.few_samples and time == comparison.few_samples[0][1] else ""
-        rows.append(
-            [
-                *(title, *differences, same_light, str(reads), str(picture.samples), f"{picture.seconds:.1f}"),
-                "" if np.isnan(time) else f"{bound}{time:.2g}",
-            ]
-        )
+        rows.append([title, brightness, *differences, same_light, str(reads), str(picture.samples)])
+        rows[-1] += [f"{picture.seconds:.1f}", "" if np.isnan(time) else f"{bound}{time:.2g}"]
     return table(("picture", *columns), rows)
 
 
 def quirk_table(comparison: Comparison) -> Table:
-    """Return a table of the quirks, largest fraction first, for a terminal."""
-    shares = comparison.shares
-    columns = ("quirk", "path tracer\ndrop", "\nrise", "\nshare", "same light\ndrop", "\nrise", "\nshare")
+    """Return a table of the visible quirks, largest fraction first, for a terminal."""
     rows = []
-    for name in ordered(shares.path_traced):
-        row = [name]
-        for against in (shares.path_traced, shares.same_light):
-            one = against.quirks[name]
-            # Adding zero removes the sign of −0.
-            drop, rise, share = (round(value, 2) + 0.0 for value in (one.drop, one.rise, one.share))
-            row += [f"{drop:+.2f}", f"{rise:+.2f}", f"{share:.0%}"]
-        rows.append(row)
-    return table(columns, rows)
-
-
-def ordered(against: AgainstReference) -> list[str]:
-    """Sort the names of the quirks, largest fraction first."""
-    return sorted(against.quirks, key=lambda name: against.quirks[name].share, reverse=True)
+    for name in comparison.shares.visible():
+        one = comparison.shares.quirks[name]
+        rows.append([name, CAUSES[name], f"{one.drop:+.2f}", f"{one.rise:+.2f}", f"{one.share:.0%}"])
+    return table(("quirk", "cause", "drop", "rise", "share"), rows)
 
 
 def notes(comparison: Comparison) -> list[str]:
     """Return explanations of the tables, one line each."""
     rows, columns = comparison.surface.shape
     lines = [
-        f"compared: the {100 * comparison.surface.mean():.0f} % of {columns} × {rows} pixels that show only surfaces; "
+        f"compared: the {100 * comparison.surface.mean():.0f} % of {columns} × {rows} pixels that show only gratings; "
         f"Y = {comparison.white:.4g} is white; one exposure factor gives a picture the mean luminance of its reference",
+        "gratings are shown with what lies below them"
+        if comparison.pigment
+        else "gratings show diffraction alone, without what lies below them",
+        f"brightness: {PUBLISHED_BRIGHTNESS:g} in the published program; a factor of the diffraction alone",
         "same light: the shader's, of directional and point lights; here with the shadows that surfaces cast",
         "ΔE00 to same light: the mean, of pictures of the same points, so that noise cancels",
         "reads: texels of two numbers (shader), or packets of four for the wavelengths of a ray (this model)",
@@ -135,11 +145,11 @@ def notes(comparison: Comparison) -> list[str]:
             f"quirks: pictures of {shares.size[0]} × {shares.size[1]} pixels, {shares.samples} samples, "
             f"{shares.shading_points} shading points"
         )
-        for name, one in (("path tracer", shares.path_traced), ("same light", shares.same_light)):
-            lines.append(
-                f"quirks, mean ΔE00 to the {name}: {one.published:.2f} as published, {one.corrected:.2f} corrected"
-                + ("" if one.noise is None else f"; noise {one.noise:.2f}")
-            )
+        lines.append(
+            f"quirks, mean ΔE00 to same light: {shares.published:.2f} as published, {shares.corrected:.2f} corrected"
+        )
+        if below := [name for name in shares.quirks if name not in shares.visible()]:
+            lines.append(f"quirks whose drop and rise are at most {MIN_EFFECT:g}: {', '.join(below)}")
         lines += [
             "drop: decrease of the published shader's mean ΔE00 with this quirk alone corrected",
             "rise: increase of the corrected shader's mean ΔE00 with this quirk alone added",
@@ -158,8 +168,10 @@ def as_dict(comparison: Comparison) -> dict[str, object]:
     surface = found.pop("surface")
     found |= {"size": surface.shape[::-1], "compared": float(surface.mean())}
     found["pictures"] = {
-        name: {"samples": picture.samples, "seconds": picture.seconds} for name, picture in comparison.pictures.items()
+        name: {"samples": picture.samples, "seconds": picture.seconds, "brightness": picture.brightness}
+        for name, picture in comparison.pictures.items()
     }
+    found["published_brightness"] = PUBLISHED_BRIGHTNESS
     for reference in ("to_path_traced", "to_same_light"):
         found[reference] = {
             name: {number: getattr(one, number) for number in _NUMBERS} for name, one in found[reference].items()
@@ -168,10 +180,16 @@ def as_dict(comparison: Comparison) -> dict[str, object]:
 
 
 def shown(comparison: Comparison, name: str) -> NDArray[np.uint8]:
-    """Return a picture of the comparison for a display, at its exposure: (height, width, 3)."""
+    """Return a picture of the comparison for a display, at its exposure: (height, width, 3).
+
+    Diffraction alone is on black, as in the published pictures.
+    """
     found = comparison.to_path_traced.get(name)
     exposure = (1 if found is None else found.exposure) / comparison.white
-    return on_screen(into_gamut(XYZ_to_linear_sRGB(comparison.pictures[name].xyz * exposure)))
+    xyz = comparison.pictures[name].xyz * exposure
+    if not comparison.pigment:
+        xyz = np.where(comparison.surface[..., None], xyz, 0)
+    return on_screen(into_gamut(XYZ_to_linear_sRGB(xyz)))
 
 
 def figure(comparison: Comparison) -> Figure:
@@ -181,7 +199,7 @@ def figure(comparison: Comparison) -> Figure:
     aspect = comparison.surface.shape[0] / comparison.surface.shape[1]
     names = titles(comparison)
     rows = -(-len(names) // 4)
-    result = Figure(figsize=(12, rows * (5.3 * aspect + 0.8)), layout="constrained")
+    result = Figure(figsize=(12, rows * (5.5 * aspect + 0.8)), layout="constrained")
     axes = result.subplots(2 * rows, 4)
     limit = max(2.0, float(np.ceil(comparison.to_path_traced["published"].percentile_95)))
     for panel in axes.ravel():
@@ -189,46 +207,47 @@ def figure(comparison: Comparison) -> Figure:
     for index, (name, title) in enumerate(names.items()):
         row, column = divmod(index, 4)
         axes[2 * row, column].imshow(shown(comparison, name), interpolation="nearest")
-        axes[2 * row, column].set_title(title, fontsize="medium")
+        axes[2 * row, column].set_title(title, fontsize="large")
         if (found := comparison.to_path_traced.get(name)) is not None:
             panel = axes[2 * row + 1, column]
             panel.set_axis_on()
             image = panel.imshow(found.delta_e, cmap="inferno", vmin=0, vmax=limit, interpolation="nearest")
             panel.set_facecolor("0.88")
             panel.set(xticks=[], yticks=[])
-            panel.set_title(f"mean {found.mean:.1f}, 95 % {found.percentile_95:.1f}", fontsize="medium")
+            panel.set_title(f"mean difference {found.mean:.1f}", fontsize="large")
             panel.spines[:].set_visible(False)
     bar = result.colorbar(image, ax=axes[1, 3], extend="max", pad=0.03)
-    bar.set_label("CIEDE2000 to the path tracer", fontsize="small")
+    bar.set_label("colour difference, CIEDE2000")
     if comparison.shares is not None:
-        axes[1, 0].set_axis_on()
-        _bars(axes[1, 0], comparison.shares.path_traced)
-        axes[1, 0].set_box_aspect(aspect)
+        # Its labels do not widen the margin of the pictures.
+        panel = axes[1, 0].inset_axes((0.56, 0.17, 0.44, 0.8))
+        panel.set_in_layout(False)
+        _bars(panel, comparison.shares)
     return result
 
 
-def _bars(panel: Axes, against: AgainstReference) -> None:
+def _bars(panel: Axes, shares: QuirkShares) -> None:
     """Plot `rise` and `drop` of the quirks."""
-    names = ordered(against)
+    names = shares.visible()
     positions = np.arange(len(names))
     for offset, attribute, colour, label in (
-        (-0.2, "rise", "C0", "added alone"),
-        (0.2, "drop", "0.6", "corrected alone"),
+        (-0.2, "rise", "C0", "added"),
+        (0.2, "drop", "0.6", "corrected"),
     ):
-        values = [getattr(against.quirks[name], attribute) for name in names]
+        values = [getattr(shares.quirks[name], attribute) for name in names]
         panel.barh(positions + offset, values, height=0.4, color=colour, label=label)
     panel.axvline(0, color="0.3", linewidth=0.8)
-    panel.set_yticks(positions, [name.replace("_", " ") for name in names], fontsize="x-small")
+    panel.set_yticks(positions, [CAUSES[name] for name in names], fontsize="small")
     panel.invert_yaxis()
-    panel.tick_params(axis="x", labelsize="x-small")
-    panel.set_xlabel("mean ΔE00 due to a quirk", fontsize="small")
+    panel.tick_params(axis="x", labelsize="small")
+    panel.set_xlabel("mean difference", fontsize="small")
     widest = max(1.0, *map(abs, panel.get_xlim()))  # so that noise does not look like an effect
     panel.set_xlim(min(panel.get_xlim()[0], -0.1 * widest), max(panel.get_xlim()[1], widest))
-    panel.legend(fontsize="x-small", frameon=False, loc="lower center", bbox_to_anchor=(0.4, 1), ncols=2)
+    panel.legend(fontsize="x-small", frameon=False, loc=(0.42, 0.02), handlelength=0.7)
     panel.spines[["top", "right"]].set_visible(False)
 
 
-def save_figure(comparison: Comparison, path: str | os.PathLike[str], dpi: float = 150) -> None:
+def save_figure(comparison: Comparison, path: str | os.PathLike[str], dpi: float = 110) -> None:
     """Write `figure` as PNG, atomically."""
     with whole_file(path) as temporary:
         figure(comparison).savefig(temporary, format="png", dpi=dpi, metadata=METADATA)

@@ -63,9 +63,11 @@ class Shader:
         own_quirks: names of the quirks that affect this shader.
         peak: S(0) of a flat surface, µm², the normalisation of the relative radiance.
         texel_reads: maximum number of texels read for one shading point.
+        brightness_unit: factor of the colour for a brightness of one.
     """
 
     own_quirks: ClassVar[tuple[str, ...]]
+    brightness_unit: ClassVar[float] = 1.0
     peak: float
     texel_reads: int
 
@@ -79,6 +81,11 @@ class Shader:
         other = copy.copy(self)
         other.quirks = quirks
         return other
+
+    @property
+    def has_free_scale(self) -> bool:
+        """Whether the brightness scales the colour, which is not a radiance in the scene's units."""
+        return True
 
     def weights(self, r_0: ArrayLike = PUBLISHED_R0, light: ArrayLike | None = None) -> SpectralWeights:
         """Return the `SpectralWeights` of a material and a light."""
@@ -103,8 +110,8 @@ class TextureShader(Shader):
     """
 
     own_quirks = (
-        *("fresnel_squared", "schlick", "fixed_index", "floor_anchor", "heights_from_zero", "fixed_coherence"),
-        *("d65_light", "relative", "d65_twice", "cie_rgb_matrix"),
+        *("schlick", "fixed_index", "floor_anchor", "fixed_terms", "fixed_coherence"),
+        *("d65_light", "relative", "cie_rgb_matrix"),
     )
     origin_at_centre: ClassVar[bool] = False
     published_terms: ClassVar[int]
@@ -146,7 +153,7 @@ class TextureShader(Shader):
         self._coherence_lengths = coherence_length, corrected_coherence_length or coherence_length
         self.extent, self.exact_fresnel = extent, exact_fresnel
         self._height_field, self._terms, self._max_height_scale = height_field, terms, max_height_scale
-        self._textures: dict[tuple[bool, tuple[float, float] | None], TaylorTextures] = {}
+        self._textures: dict[tuple[int, tuple[float, float] | None], TaylorTextures] = {}
         self._bind()
 
     def with_quirks(self, quirks: Quirks) -> TextureShader:
@@ -160,20 +167,23 @@ class TextureShader(Shader):
         if self.tapers:
             taper, lengths = tapered(self._height_field, self.coherence_length)
         self.sigmas = tuple(self.sigma * self.coherence_length / length for length in lengths)
-        kind = self.quirks.heights_from_zero, lengths if self.tapers else None
+        kind = self.terms, lengths if self.tapers else None
         if kind not in self._textures:
             texels, height = taylor_transforms(
                 self._height_field,
                 self.terms,
-                heights_from_zero=self.quirks.heights_from_zero,
                 origin_at_centre=self.origin_at_centre,
                 taper=taper,
                 margin=self.margin,
             )
             self._textures[kind] = TaylorTextures(texels, height)
         self.textures = self._textures[kind]
-        matrix = rgb_matrix(cie_rgb_matrix=self.quirks.cie_rgb_matrix, d65_twice=self.quirks.d65_twice)
+        matrix = rgb_matrix(cie_rgb_matrix=self.quirks.cie_rgb_matrix)
         self.matrix = [[opaque(float(entry)) for entry in row] for row in matrix]
+
+    @property
+    def has_free_scale(self) -> bool:
+        return self.quirks.relative
 
     @property
     def coherence_length(self) -> float:
@@ -185,7 +195,7 @@ class TextureShader(Shader):
         """The number of Taylor terms."""
         if self._terms is not None:
             return self._terms
-        if self.quirks.heights_from_zero:
+        if self.quirks.fixed_terms:
             return self.published_terms
         return terms_for(MAX_KAPPA * self._height_field.half_range * self._max_height_scale, SERIES_ERROR)
 
@@ -213,13 +223,11 @@ class TextureShader(Shader):
         return gain.factor * self.fresnel(mi.Float(PUBLISHED_R0), gain) * power
 
     def fresnel(self, r_0: mi.Float, gain: Gain) -> mi.Float:
-        """Return F(ω_o·h)/F(1) or its square."""
+        """Return F(ω_o·h)/F(1)."""
         if self.quirks.schlick or not self.exact_fresnel:
-            ratio = (r_0 + (1 - r_0) * gain.falloff) / r_0
-        else:
-            root = dr.sqrt(r_0)
-            ratio = mi.fresnel(gain.cos_half, (1 + root) / (1 - root))[0] / r_0
-        return dr.square(ratio) if self.quirks.fresnel_squared else ratio
+            return (r_0 + (1 - r_0) * gain.falloff) / r_0
+        root = dr.sqrt(r_0)
+        return mi.fresnel(gain.cos_half, (1 + root) / (1 - root))[0] / r_0
 
     def integral(self, gain: Gain, weights: SpectralWeights, height_scale: mi.Float) -> mi.Color3f:
         """Integrate F/F₀ |P|² S (x̄, ȳ, z̄) over λ by the trapezoidal rule."""

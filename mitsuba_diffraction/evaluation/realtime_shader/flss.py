@@ -32,7 +32,7 @@ class FLSS(TextureShader):
         sigmas: σ along x and y, in cycles/µm: σ_f, or, of a tapered scan, the smaller ones of `taper.py`.
     """
 
-    own_quirks = (*TextureShader.own_quirks, "window_pi", "complex_window_sum", "one_texel", "periodic_scan")
+    own_quirks = (*TextureShader.own_quirks, "complex_window_sum", "one_texel", "periodic_scan")
     published_terms = 37
 
     def __init__(
@@ -88,7 +88,7 @@ class FLSS(TextureShader):
     ) -> Callable[[mi.Int32, mi.Int32], mi.Float]:
         """Return φ of the texels m, with distances along x and y scaled by the given factors."""
         # The height of a narrower window keeps the power of a flat mirror.
-        height = (float(np.pi) if self.quirks.window_pi else 1.0) * self.sigma / float(np.sqrt(np.prod(self.sigmas)))
+        height = self.sigma / float(np.sqrt(np.prod(self.sigmas)))
         scale_x, scale_y = (
             1 / (float(np.sqrt(2)) * sigma * size) for sigma, size in zip(self.sigmas, self.tile_size, strict=True)
         )

@@ -26,14 +26,15 @@ class GEM(Shader):
 
         c = Σ_{n=1}^{7} max(0, 1 − 16 (y_n − y_c)²) + e^{−(r d u/w)²},     y_c = 3/4, 1/2, 1/4 for red, green, blue,
 
-    with y = 2λ − 1 (λ in µm), which maps 0.5 to 1 µm to the rainbow. The profile of the surface is ignored.
+    with y = (λ − 0.38 µm)/0.4 µm; GPU Gems maps 0.5 to 1 µm to the rainbow. The profile of the surface is ignored.
 
     Attributes:
         spacing: d in µm.
         roughness: r in 1/µm.
     """
 
-    own_quirks = ("infrared_rainbow",)
+    own_quirks = ()
+    brightness_unit = 1 / 4000
     peak = 1.0  # unused: the shader computes colours, not a relative radiance
     texel_reads = 0
 
@@ -66,9 +67,8 @@ class GEM(Shader):
         path = dr.abs(wi.x + wo.x) * self.spacing
         highlight = dr.exp(-dr.square(self.roughness * path / dr.maximum(wi.z + wo.z, 1e-6)))
         result = mi.Color3f(highlight)
-        start, width = (0.5, 0.5) if self.quirks.infrared_rainbow else (0.38, 0.4)  # µm
         for n in range(1, ORDERS + 1):
-            y = (path / n - start) / width
+            y = (path / n - 0.38) / 0.4  # µm
             result += mi.Color3f(*(dr.maximum(1 - dr.square(4 * (y - peak)), 0) for peak in _RAINBOW))
         return dr.select(active, weights.luminance * result, 0)
 

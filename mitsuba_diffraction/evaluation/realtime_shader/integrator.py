@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import replace
 
 import drjit as dr
@@ -11,6 +12,7 @@ from numpy.typing import NDArray
 
 from ...bsdf.fresnel import Dielectric
 from ...bsdf.layers import Layers
+from ...bsdf.tables import opaque
 from ...errors import RequestError
 from ...manual import Parameter, listed
 from .base import Shader
@@ -19,15 +21,21 @@ from .lights import Light, lights_of, spectrum_of
 from .pq import PQ
 from .quirks import Quirks
 from .surfaces import Shaded, gratings_of, in_place, recipe_of, sum_along
-from .tristimulus import Emission, with_power_gamma
+from .tristimulus import Emission
+
+PUBLISHED_BRIGHTNESS = 1000.0
+"""Of every variant of the published program, unless its slider is moved (github.com/simplay/Bachelor-Thesis)."""
 
 PARAMETERS = (
     Parameter("variant", "string", "flss, nmm, pq, nmm_pq or gem", "flss"),
     Parameter("as_published", "boolean", "with all quirks of the published shader, or with none", "true"),
+    Parameter("schlick, relative, …", "boolean", "overrides as_published for one quirk; `Quirks` lists them"),
     Parameter(
-        "fresnel_squared, window_pi, …",
-        "boolean",
-        "overrides as_published for one quirk; `Quirks` lists them",
+        "brightness",
+        "float",
+        "the slider of the published program, a factor of the diffraction alone; 0 is its default. pq halves it, gem "
+        "divides it by 4000; radiance that is not relative has none",
+        "1000",
     ),
     Parameter("terms", "integer", "Taylor terms; default: as published; corrected, as many as needed; not for gem"),
     Parameter("window", "string", "texel or 4sigma; overrides one_texel; for flss and nmm only"),
@@ -72,6 +80,7 @@ def define() -> type:
             self.diffuse_weight = props.get("diffuse_weight", 0.5)
             if not (isinstance(self.diffuse_weight, int | float) and 0 <= self.diffuse_weight <= 1):
                 raise RequestError(f"diffuse_weight: got {self.diffuse_weight!r}, wanted 0 to 1")
+            self.brightness = checked_brightness(props.get("brightness", PUBLISHED_BRIGHTNESS))
             self.emission = Emission()
             mi.SamplingIntegrator.__init__(self, props)
             self._shaders: list[tuple[Layers, Shader]] = []
@@ -99,7 +108,8 @@ def define() -> type:
             for layers in (bsdf.layers for bsdf in self.gratings):
                 shader, r_0 = self.shader_of(layers), _normal_reflectance(layers)
                 weights = [shader.weights(r_0, light.spectrum) for light in self.lights]
-                self.shaded.append(Shaded(layers, shader, weights, base_weight))
+                scale = self.brightness * shader.brightness_unit if shader.has_free_scale else 1.0
+                self.shaded.append(Shaded(layers, shader, weights, base_weight, opaque(scale)))
 
         def shader_of(self, layers: Layers) -> Shader:
             """Return the shader of a grating; its textures are computed once."""
@@ -172,15 +182,13 @@ def define() -> type:
 
             with in_place(self.gratings, self.shaded):
                 (rgb, radiance), active = sum_along(scene, ray, active, at_hit)
-            if self.quirks.power_gamma:
-                rgb = with_power_gamma(rgb)
             return dr.select(active, rgb, 0), radiance, active
 
         def to_string(self) -> str:
             on = [name for name in Quirks.names() if getattr(self.quirks, name)]
             return (
                 f"DiffractionShader[\n  variant = {self.variant},\n  quirks = {', '.join(on) or 'none'},\n"
-                f"  shadows = {self.shadows}\n]"
+                f"  brightness = {self.brightness:g},\n  shadows = {self.shadows}\n]"
             )
 
     return DiffractionShader
@@ -191,6 +199,17 @@ def _boolean(props: mi.Properties, name: str, default: bool) -> bool:
     if not isinstance(value, bool):
         raise RequestError(f"{name}: got {value!r}, wanted true or false")
     return value
+
+
+def checked_brightness(value: object) -> float:
+    """Return a brightness as a number; zero is the default, as in the published code.
+
+    Raises:
+        ValueError: if it is not a finite number, or negative.
+    """
+    if isinstance(value, bool) or not isinstance(value, int | float) or not 0 <= value < math.inf:
+        raise RequestError(f"brightness: got {value!r}, wanted a finite number that is not negative")
+    return float(value) or PUBLISHED_BRIGHTNESS
 
 
 def settings_of(variant: str) -> tuple[str, ...]:

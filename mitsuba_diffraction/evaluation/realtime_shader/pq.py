@@ -85,6 +85,7 @@ class PQ(TextureShader):
     """
 
     own_quirks = (*TextureShader.own_quirks, "wrong_product")
+    brightness_unit = 0.5  # on a body; 0.2 on a map of the BRDF
     origin_at_centre = True
     published_terms = 39
 

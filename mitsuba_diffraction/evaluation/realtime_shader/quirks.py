@@ -11,12 +11,13 @@ from ...errors import RequestError
 class Quirks:
     """True means "as published", false "corrected"; equations are those of the thesis of 2014.
 
+    "As published" is what made the published pictures. Where the text of the thesis differs from them, its version is
+    not emulated; docs/thesis.md lists these differences.
+
     Attributes:
-        fresnel_squared: F² with Schlick's F, which is already a power reflectance (eq. 3.4, 3.10); corrected: F.
         schlick: Schlick's approximation (eq. B.1), at 60° a fifth too low for an index of 1.5; corrected: the Fresnel
             reflectance of a dielectric. Schlick's also of a conductor.
         fixed_index: F is that of an index of 1.5 for any material; corrected: R at normal incidence of the material.
-        window_pi: the Gaussian window has the height π (eq. 3.30); corrected: 1, which gives one for a flat mirror.
         complex_window_sum: |Σ φ F|² without the spatial average ⟨·⟩; corrected: Σ φ² |F|².
         one_texel: the neighbourhood is one texel on each side (section 4.4.1); corrected: as many as
             span 4σ_f (section 4.3.2).
@@ -25,40 +26,32 @@ class Quirks:
         fixed_coherence: the window is that of a coherence length of 65 µm; corrected: that of the recipe.
         periodic_scan: a scan, a piece of an irregular surface, is one period of a tiling with seams; corrected: it is
             tapered by the mean of the windows with which this model averages over the scan (`taper.py`).
-        heights_from_zero: heights are measured from the lowest point (algorithm 4.1), with the published number of
-            Taylor terms; corrected: from the centre of their range, which halves the number of terms and the loss of
-            digits, with as many terms as an error of 1e-4 requires.
+        fixed_terms: the published number of Taylor terms for any surface; corrected: as many as an error of 1e-4
+            requires.
         no_jacobian: NMM sums its wavelengths without dλ/dn; corrected: each represents the area of its line.
         wrong_product: the imaginary part of a product in PQ is p₁p₂ + q₁q₂ (eq. 3.48); corrected: p₁q₂ + q₁p₂.
         d65_light: the light is D65; corrected: the spectrum of the light in the scene.
-        relative: radiance is relative to a flat mirror, which omits R₀ S(0)/λ² (eq. 3.7); corrected: radiance.
-        d65_twice: XYZ, already weighted by D65, is multiplied by the white point of D65 (eq. 4.10); corrected: once.
+        relative: radiance is relative to a flat mirror, which omits R₀ S(0)/λ² (eq. 3.7), times a free brightness;
+            corrected: radiance.
         cie_rgb_matrix: XYZ is converted to CIE RGB but displayed as sRGB (eq. 4.9); corrected: sRGB.
-        power_gamma: the picture is encoded with a power of 1/2.5; corrected: the transfer function of sRGB.
         constant_blend: the layer below is blended with a constant weight (algorithm 4.4, whose test |F| > 1 is never
             true); corrected: weighted by the transmittance (1 − R_i)(1 − R_o).
-        infrared_rainbow: the rainbow of GEM spans 0.5 to 1 µm; corrected: 0.38 to 0.78 µm.
     """
 
-    fresnel_squared: bool
     schlick: bool
     fixed_index: bool
-    window_pi: bool
     complex_window_sum: bool
     one_texel: bool
     floor_anchor: bool
     fixed_coherence: bool
     periodic_scan: bool
-    heights_from_zero: bool
+    fixed_terms: bool
     no_jacobian: bool
     wrong_product: bool
     d65_light: bool
     relative: bool
-    d65_twice: bool
     cie_rgb_matrix: bool
-    power_gamma: bool
     constant_blend: bool
-    infrared_rainbow: bool
 
     def __post_init__(self) -> None:
         for field in fields(self):

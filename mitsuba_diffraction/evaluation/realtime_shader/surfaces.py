@@ -76,6 +76,7 @@ class Shaded:
         shader: of its heights.
         weights: one table for each light.
         base_weight: constant weight of the base; None for the transmittance of the surface.
+        scale: factor of the colours of the shader, before they are blended with the base.
         light: index of a light: its linear sRGB is added to the first three wavelengths of the base's value; None for
             the base alone.
     """
@@ -84,6 +85,7 @@ class Shaded:
     shader: Shader
     weights: list[SpectralWeights]
     base_weight: float | None
+    scale: mi.Float
     light: int | None = None
 
     def evaluate(
@@ -110,7 +112,7 @@ class Shaded:
                 grating.scales.height.at(si, active),
             )
             for channel in range(3):
-                value[channel] += weight * rgb[channel]
+                value[channel] += weight * self.scale * rgb[channel]
         return mi.depolarizer(dr.select(active, value, 0)), mi.Float(0)
 
 

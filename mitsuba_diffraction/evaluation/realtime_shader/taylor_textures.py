@@ -44,17 +44,15 @@ def taylor_transforms(
     height_field: HeightField,
     terms: int,
     *,
-    heights_from_zero: bool,
     origin_at_centre: bool,
     taper: NDArray[np.float64] | None = None,
     margin: int = 1,
 ) -> tuple[NDArray[np.complex64], float]:
-    """Compute F{w tⁿ}(m) with t = h/H, n < N; |t| ≤ 1 bounds them by one.
+    """Compute F{w tⁿ}(m), n < N, with t = h/H and h from the centre of the heights; |t| ≤ 1 bounds them by one.
 
     Args:
-        height_field: the tile, h.
+        height_field: the tile.
         terms: N.
-        heights_from_zero: measure heights from the lowest point (H is the full range) instead of the centre.
         origin_at_centre: x = 0 at the centre of the tile instead of the first pixel, which affects the phase.
         taper: w, (N_y, N_x); default: one.
         margin: texels outside the frequencies that light reaches.
@@ -68,9 +66,8 @@ def taylor_transforms(
     """
     if isinstance(terms, bool) or not isinstance(terms, int) or terms < 1:
         raise RequestError(f"terms: got {terms!r}, wanted a whole number ≥ 1")
-    heights = height_field.heights - height_field.heights.min() if heights_from_zero else height_field.centred
-    height = height_field.height_range if heights_from_zero else height_field.half_range
-    t = heights / (height or 1.0)
+    height = height_field.half_range
+    t = height_field.centred / (height or 1.0)
     kept, phases = [], []
     for count, size in zip(height_field.shape, height_field.tile_size[::-1], strict=True):
         middle, reached = count // 2, int(np.ceil(MAX_FREQUENCY * size)) + margin

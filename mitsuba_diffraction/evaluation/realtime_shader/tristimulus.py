@@ -19,8 +19,11 @@ MIN_WAVELENGTH, MAX_WAVELENGTH, WAVELENGTH_STEP = 380.0, 780.0, 5.0  # nm
 WAVELENGTH_COUNT = 81  # from the shortest to the longest, in such steps
 PUBLISHED_R0 = 0.04  # an index of 1.5, close to that of snake skin
 
-CIE_RGB = np.array([[0.41847, -0.15866, -0.082835], [-0.091169, 0.25243, 0.015708], [0.00092090, -0.0025498, 0.17860]])
-"""XYZ → CIE RGB of 1931 (Smith and Guild 1931), eq. 4.9 of the thesis. Rows sum to 0.177."""
+CIE_RGB = (
+    np.array([[0.41847, -0.15866, -0.082835], [-0.091169, 0.25243, 0.015708], [0.00092090, -0.0025498, 0.17860]])
+    / 0.17697
+)
+"""XYZ → CIE RGB of 1931 (Smith and Guild 1931), eq. 4.9 of the thesis, as in its code: rows sum to one."""
 
 FLAT = 106.857
 """∫ȳ dλ in nm: a constant spectrum of one has Y = 1, as in `color`."""
@@ -46,17 +49,11 @@ def light_weights(spectrum: ArrayLike) -> NDArray[np.float64]:
     return np.asarray(spectrum, np.float64)[:, None] * matching_functions(wavelengths()) / FLAT
 
 
-def d65_white() -> NDArray[np.float64]:
-    """Return XYZ of D65 by the integral of the shader, Y = 1: (3,)."""
-    return np.trapezoid(d65_weights()[:: int(WAVELENGTH_STEP)], dx=WAVELENGTH_STEP, axis=0)
-
-
-def rgb_matrix(*, cie_rgb_matrix: bool, d65_twice: bool) -> NDArray[np.float64]:
-    """Return the matrix XYZ → linear RGB: M or, eq. 4.10, M diag(D65), where M is CIE RGB or sRGB (IEC 61966-2-1)."""
+def rgb_matrix(*, cie_rgb_matrix: bool) -> NDArray[np.float64]:
+    """Return the matrix XYZ → linear RGB, of CIE RGB or sRGB (IEC 61966-2-1)."""
     import colour
 
-    matrix = CIE_RGB if cie_rgb_matrix else colour.RGB_COLOURSPACES["sRGB"].matrix_XYZ_to_RGB
-    return matrix * d65_white() if d65_twice else np.array(matrix)
+    return CIE_RGB if cie_rgb_matrix else np.array(colour.RGB_COLOURSPACES["sRGB"].matrix_XYZ_to_RGB)
 
 
 class SpectralWeights:
@@ -141,9 +138,3 @@ class Emission:
             b = interpolated(self.table, (wavelengths[channel] - first) / spacing, EMISSION.size - 1, active)
             result[channel] = rgb.x * b.x + rgb.y * b.y + rgb.z * b.z
         return result
-
-
-def with_power_gamma(rgb: mi.Color3f) -> mi.Color3f:
-    """Return the linear sRGB that an sRGB display (IEC 61966-2-1) emits for linear RGB encoded by a power of 1/2.5."""
-    encoded = dr.power(dr.maximum(rgb, 0), 1 / 2.5)
-    return dr.select(encoded <= 0.04045, encoded / 12.92, dr.power((encoded + 0.055) / 1.055, 2.4))

@@ -14,7 +14,10 @@ const NUMBERS = {
   coherenceLength: (x) => `${x.toPrecision(3)} µm`,
   index: (x) => x.toFixed(2),
   terms: (x) => String(x),
+  brightness: (x) => x.toPrecision(3),
 };
+
+const LOGARITHMIC = ["coherenceLength", "brightness"];
 
 class Controls {
   constructor(state, changed, actions) {
@@ -47,10 +50,9 @@ class Controls {
     this.show();
   }
 
-  // The coherence length is on a logarithmic scale.
   valueOf(name) {
     const value = Number($(name).value);
-    return name === "coherenceLength" ? Math.exp(value) : value;
+    return LOGARITHMIC.includes(name) ? Math.exp(value) : value;
   }
 
   set(changes) {
@@ -62,7 +64,7 @@ class Controls {
   show() {
     const { state } = this;
     for (const [name, text] of Object.entries(NUMBERS)) {
-      $(name).value = name === "coherenceLength" ? Math.log(state[name]) : state[name];
+      $(name).value = LOGARITHMIC.includes(name) ? Math.log(state[name]) : state[name];
       $(`${name}-shown`).textContent = text(state[name]);
     }
     for (const name of CHOICES) $(name).value = state[name];
@@ -72,6 +74,7 @@ class Controls {
     $("difference").disabled = !compares;
     $("of-shader").hidden = !isShader;
     $("terms").disabled = state.right === "gem";
+    $("brightness").disabled = state.right !== "gem" && !state.quirks.relative;
     for (const [name, [, variants]] of Object.entries(QUIRKS)) {
       $(`quirk-${name}`).checked = state.quirks[name];
       $(`quirk-${name}`).parentElement.hidden = !variants.includes(state.right);

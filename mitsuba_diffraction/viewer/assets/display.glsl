@@ -6,7 +6,6 @@ uniform highp sampler2D uOther;  // the other side: a mean, or linear sRGB of a 
 uniform bool uOtherIsPicture;
 uniform vec4 uOtherScale;  // scale and offset of its pixels
 uniform float uOtherExposure;
-uniform bool uPowerGamma;  // of the other side
 uniform float uDivider;    // pixels from the left
 uniform bool uDifference;
 uniform float uScale;           // of the drawn part of the mean
@@ -96,16 +95,13 @@ void main() {
   vec4 found = vec4(0.0);
   ivec2 at = ivec2(gl_FragCoord.xy * uOtherScale.xy + uOtherScale.zw);
   if (all(greaterThanEqual(at, ivec2(0))) && all(lessThan(at, textureSize(uOther, 0)))) found = texelFetch(uOther, at, 0);
-  vec3 theirs = uPowerGamma && !uOtherIsPicture
-    ? pow(clamp(uOtherExposure * max(ofMean(found), 0.0), 0.0, 1.0), vec3(1.0 / 2.5))
-    : encode(shown(uOtherIsPicture ? found.rgb : ofMean(found), uOtherExposure));
+  vec3 theirs = shown(uOtherIsPicture ? found.rgb : ofMean(found), uOtherExposure);
   float cover = uOtherIsPicture ? 1.0 : found.a;
   vec3 colour = mix(uBackground, encode(ours), mean.a);
   if (uDifference) {
-    vec3 linear = mix(pow((theirs + 0.055) / 1.055, vec3(2.4)), theirs / 12.92, lessThanEqual(theirs, vec3(0.04045)));
-    colour = mix(uBackground, heat(deltaE(toLab(ours), toLab(linear)) / MAX_DELTA_E), min(mean.a, cover));
+    colour = mix(uBackground, heat(deltaE(toLab(ours), toLab(theirs)) / MAX_DELTA_E), min(mean.a, cover));
   } else if (gl_FragCoord.x > uDivider) {
-    colour = mix(uBackground, theirs, cover);
+    colour = mix(uBackground, encode(theirs), cover);
   }
   if (abs(gl_FragCoord.x - uDivider) < 1.0 && !uDifference) colour = vec3(0.5);
   oColour = vec4(colour, 1.0);

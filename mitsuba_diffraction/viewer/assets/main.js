@@ -20,7 +20,7 @@ function initialState(data) {
     index: material.int_ior,
     hasBase: false, pigment: "#40301c",
     right: "none", divider: 0.5, difference: false,
-    quirks: allQuirks(true), terms: 37,
+    quirks: allQuirks(true), terms: 37, brightness: PUBLISHED_BRIGHTNESS,
     drag: "light",
     maxFrames: MAX_FRAMES,
   };
@@ -37,6 +37,7 @@ function prepareControls(data) {
   const [shortest, longest] = coherenceLengths(spectrum);
   Object.assign($("coherenceLength"), { min: Math.log(shortest), max: Math.log(longest), step: "any" });
   $("coherenceLength").disabled = shortest === longest;
+  Object.assign($("brightness"), { min: Math.log(10), max: Math.log(100000), step: "any" });
   if (!data.heights) for (const name of Object.keys(VARIANTS)) $("right").querySelector(`[value=${name}]`).remove();
   if (!data.picture) $("right").querySelector("[value=picture]").remove();
   $("source").textContent = data.source;

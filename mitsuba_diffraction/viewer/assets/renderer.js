@@ -244,7 +244,6 @@ class Renderer {
       uOtherIsPicture: Number(isPicture),
       uExposure: exposure * this.normal,
       uOtherExposure: exposure * (isPicture ? this.normal : this.otherNormal),
-      uPowerGamma: Number(Boolean(this.shader) && state.quirks.power_gamma),
       uDivider: state.right === "none" ? 1e6 : state.divider * gl.drawingBufferWidth,
       uDifference: Number(state.difference && state.right !== "none"),
       uBackground: background,

@@ -18,8 +18,9 @@ uniform float uSpacing;                // of GEM, um
 uniform highp sampler2D uMatching;     // x, y, z and the light at each nm from 360
 uniform mat3 uToRGB;                   // from XYZ
 uniform mat3 uFromRGB;                 // linear sRGB to XYZ
-uniform bool uFresnelSquared, uSchlick, uFixedIndex, uWindowPi, uComplexSum, uFloor, uNoJacobian, uWrongProduct, uRelative;
-uniform bool uConstantBlend, uInfrared;
+uniform bool uSchlick, uFixedIndex, uComplexSum, uFloor, uNoJacobian, uWrongProduct, uRelative;
+uniform bool uConstantBlend;
+uniform float uBrightness;             // of the diffraction alone; one for radiance
 
 const float FIRST = 380.0, LAST = 780.0, STEP = 5.0;  // nm
 const int COUNT = 81;
@@ -48,14 +49,9 @@ vec4 weightsAt(float nanometres, float peak) {
 }
 
 float fresnelRatio(float r, float cosHalf) {
-  float ratio;
-  if (uSchlick || MATERIAL != DIELECTRIC) {
-    float x = 1.0 - cosHalf;
-    ratio = (r + (1.0 - r) * x * x * x * x * x) / r;
-  } else {
-    ratio = dielectricOf(cosHalf, (1.0 + sqrt(r)) / (1.0 - sqrt(r))) / r;
-  }
-  return uFresnelSquared ? ratio * ratio : ratio;
+  float x = 1.0 - cosHalf;
+  if (uSchlick || MATERIAL != DIELECTRIC) return (r + (1.0 - r) * x * x * x * x * x) / r;
+  return dielectricOf(cosHalf, (1.0 + sqrt(r)) / (1.0 - sqrt(r))) / r;
 }
 
 // sum_n (i x)^n/n! F{t^n}, zero outside of the texture.
@@ -74,7 +70,7 @@ vec2 amplitude(ivec2 m, float x) {
 float phi(ivec2 m, vec2 at, vec2 stretch) {
   vec2 d = (vec2(m) - at) / (1.41421356 * uWindowSigmas * uTile) * stretch;
   float height = uWindowSigma * inversesqrt(uWindowSigmas.x * uWindowSigmas.y);
-  return (uWindowPi ? 3.14159265 : 1.0) * height * exp(-dot(d, d));
+  return height * exp(-dot(d, d));
 }
 
 // |sum phi F|^2 or sum phi^2 |F|^2 about `at`, in texels; with an axis, only of the `order` along it.
@@ -256,9 +252,8 @@ vec3 gem(vec3 wi, vec3 wo) {
   float path = abs(wi.x + wo.x) * uSpacing;
   float rough = 5.0 * path / max(wi.z + wo.z, 1e-6);
   vec3 result = vec3(exp(-rough * rough));
-  float start = uInfrared ? 0.5 : 0.38, width = uInfrared ? 0.5 : 0.4;
   for (int n = 1; n <= 7; n++) {
-    vec3 d = 4.0 * ((path / float(n) - start) / width - vec3(0.75, 0.5, 0.25));
+    vec3 d = 4.0 * ((path / float(n) - 0.38) / 0.4 - vec3(0.75, 0.5, 0.25));
     result += max(1.0 - d * d, 0.0);
   }
   return result;
@@ -268,7 +263,7 @@ vec3 gem(vec3 wi, vec3 wo) {
 vec3 shaderRGB(vec3 wi, vec3 wo) {
   if (wi.z <= 0.0 || wo.z <= 0.0) return vec3(0.0);
 #if VARIANT == 3
-  return gem(wi, wo);
+  return uBrightness * gem(wi, wo);
 #else
   Pair pair;
   pair.uvw = -wi - wo;
@@ -288,7 +283,7 @@ vec3 shaderRGB(vec3 wi, vec3 wo) {
 #else
   vec3 xyz = overWavelengths(pair, peak);
 #endif
-  return uToRGB * (pair.factor * xyz);
+  return uToRGB * (uBrightness * pair.factor * xyz);
 #endif
 }
 

@@ -9,41 +9,29 @@ const SERIES = [...WINDOWS, ...TILES];
 
 // Their names, and the variants that have them.
 const QUIRKS = {
-  fresnel_squared: ["Fresnel squared", SERIES],
   schlick: ["Schlick's Fresnel", SERIES],
   fixed_index: ["index 1.5 for every material", SERIES],
-  window_pi: ["window times π", WINDOWS],
   complex_window_sum: ["complex sum over the window", WINDOWS],
   one_texel: ["window of one texel", WINDOWS],
   fixed_coherence: ["coherence length of 65 µm", SERIES],
   periodic_scan: ["scan as one period", WINDOWS],
   floor_anchor: ["window about floor(q T)", SERIES],
-  heights_from_zero: ["heights from the lowest point", SERIES],
   no_jacobian: ["no dλ/dn", ["nmm", "nmm_pq"]],
   wrong_product: ["wrong imaginary part", TILES],
   relative: ["relative radiance (no 1/λ²)", SERIES],
-  d65_twice: ["D65 twice", SERIES],
   cie_rgb_matrix: ["CIE RGB shown as sRGB", SERIES],
-  power_gamma: ["gamma 2.5", [...SERIES, "gem"]],
   constant_blend: ["constant blend with the pigment", [...SERIES, "gem"]],
-  infrared_rainbow: ["rainbow of 0.5 to 1 µm", ["gem"]],
 };
 const PUBLISHED_TERMS = { flss: 37, nmm: 31, pq: 39, nmm_pq: 39, gem: 37 };
+// Of the published program, and what one of it is of the colour.
+const PUBLISHED_BRIGHTNESS = 1000;
+const BRIGHTNESS_UNITS = { flss: 1, nmm: 1, pq: 0.5, nmm_pq: 0.5, gem: 1 / 4000 };
 const allQuirks = (on) => Object.fromEntries(Object.keys(QUIRKS).map((name) => [name, on]));
 
 const RGB_TO_XYZ = [[0.4124, 0.3576, 0.1805], [0.2126, 0.7152, 0.0722], [0.0193, 0.1192, 0.9505]];
-const CIE_RGB = [[0.41847, -0.15866, -0.082835], [-0.091169, 0.25243, 0.015708], [0.0009209, -0.0025498, 0.1786]];
+const CIE_RGB = [[0.41847, -0.15866, -0.082835], [-0.091169, 0.25243, 0.015708], [0.0009209, -0.0025498, 0.1786]].map(
+  (row) => row.map((value) => value / 0.17697));
 const columns = (matrix) => [0, 1, 2].flatMap((i) => matrix.map((row) => row[i]));
-
-// X, Y, Z of the light by the trapezoidal rule at 5 nm from 380 to 780.
-function whiteOfShader() {
-  const white = [0, 0, 0];
-  for (let nm = 380; nm <= 780; nm += 5) {
-    const weight = (nm === 380 || nm === 780 ? 2.5 : 5) * matching[4 * (nm - 360) + 3];
-    for (let k = 0; k < 3; k++) white[k] += weight * matching[4 * (nm - 360) + k];
-  }
-  return white;
-}
 
 // Discrete Fourier transform of complex numbers, e^(-2 pi i m x/N), for any N (Cooley and Tukey 1965).
 function fourier(re, im) {
@@ -131,19 +119,18 @@ class Shader2014 {
 
   // Which textures a state needs.
   kindOf(state) {
-    return `${state.quirks.heights_from_zero ? "lowest" : "middle"} ${this.taperOf(state)}`;
+    return this.taperOf(state);
   }
 
-  // Makes the textures of w t^n, t = h/H, with heights from the lowest point or from the middle, and a taper w.
+  // Makes the textures of w t^n, t = h/H, with heights from the middle, and a taper w.
   async prepare(state, progress) {
     const kind = this.kindOf(state);
     if (this.textures.has(kind)) return;
     const { gl, rows, columns, order } = this;
-    const fromLowest = state.quirks.heights_from_zero;
     const taper = this.tapers[this.taperOf(state)];
     const range = this.heights.range;
-    const height = fromLowest ? range : range / 2;
-    const t = this.values.map((v) => (range === 0 ? 0 : (fromLowest ? v : v - range / 2) / height));
+    const height = range / 2;
+    const t = this.values.map((v) => (range === 0 ? 0 : (v - height) / height));
     const [width, depth] = order.map((m) => 2 * m + 1);
     const made = texture(gl, gl.TEXTURE_2D_ARRAY);
     gl.texStorage3D(gl.TEXTURE_2D_ARRAY, 1, gl.RG32F, width, depth, MAX_TERMS);
@@ -201,9 +188,8 @@ class Shader2014 {
     const sigma = Math.SQRT2 * lobeWidth(length);
     const taper = this.tapers[this.taperOf(state)];
     const sigmas = [0, 1].map((axis) => (taper ? (sigma * length) / taper[axis].length : sigma));
-    const white = whiteOfShader();
     const matrix = quirks.cie_rgb_matrix ? CIE_RGB : XYZ_TO_RGB;
-    const scale = quirks.d65_twice ? white.map((w) => w / white[1]) : [1, 1, 1];
+    const hasFreeScale = state.right === "gem" || quirks.relative;
     const radius = (size, k) => (quirks.one_texel ? 1 : Math.min(Math.max(Math.ceil(2 * sigmas[k] * size - 0.5), 1), 16));
     return {
       ...this.model.uniforms(state),
@@ -218,19 +204,17 @@ class Shader2014 {
       uRadius: this.tile.map(radius),
       uTiles: this.tile.map((size) => Math.max(1, Math.round(length / size))),
       uSpacing: this.spacing,
-      uToRGB: columns(matrix.map((row) => row.map((value, k) => value * scale[k]))),
+      uToRGB: columns(matrix),
+      uBrightness: hasFreeScale ? state.brightness * BRIGHTNESS_UNITS[state.right] : 1,
       uFromRGB: columns(RGB_TO_XYZ),
-      uFresnelSquared: Number(quirks.fresnel_squared),
       uSchlick: Number(quirks.schlick),
       uFixedIndex: Number(quirks.fixed_index),
-      uWindowPi: Number(quirks.window_pi),
       uComplexSum: Number(quirks.complex_window_sum),
       uFloor: Number(quirks.floor_anchor),
       uNoJacobian: Number(quirks.no_jacobian),
       uWrongProduct: Number(quirks.wrong_product),
       uRelative: Number(quirks.relative),
       uConstantBlend: Number(quirks.constant_blend),
-      uInfrared: Number(quirks.infrared_rainbow),
     };
   }
 }
