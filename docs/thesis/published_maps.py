@@ -308,7 +308,7 @@ def plot_heights(curves: Mapping[str, Array]) -> Figure:
         panel.axvline(published.height, color="0.4", linestyle="--", linewidth=1, label="height in the maps")
         panel.set_title(published.name, fontsize=11)
         panel.set_xlabel("height, black to white / µm")
-        panel.set_ylim(0, 1.02)
+        panel.set_ylim(0.88, 1.005)
         panel.grid(alpha=0.3)
     axes[0].set_ylabel("correlation with the published map")
     drawn.legend(*axes[0].get_legend_handles_labels(), loc="outside lower center", ncols=3, frameon=False)
