@@ -91,11 +91,6 @@ class Coat:
         self.eta, self.depth = opaque(self.relative), opaque(depth)
         self.absorbs = depth > 0
 
-    def refracted(self, omega: mi.Vector3f) -> mi.Vector3f:
-        """Return the direction inside the layer that is refracted to or from ω outside."""
-        x, y = omega.x / self.eta, omega.y / self.eta
-        return mi.Vector3f(x, y, dr.safe_sqrt(1 - dr.square(x) - dr.square(y)))
-
     def cos_inside(self, cos: mi.Float) -> mi.Float:
         """Return cos θ' for the cosine of an angle outside."""
         return dr.safe_sqrt(1 - (1 - dr.square(cos)) / dr.square(self.eta))

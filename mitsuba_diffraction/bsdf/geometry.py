@@ -227,11 +227,16 @@ class Geometry:
         return tuple(k.normal(k.square) * k.per_inner_index for k in (self.incident, self.outgoing))
 
     def cos_half(self) -> mi.Float:
-        """Return ω_i·h, negative from below as `mi.fresnel` expects."""
-        k_i = self.incident
+        """Return the cosine of ω and h, negative from below as `mi.fresnel` expects.
+
+        ω is ω_i of reflected light, and the direction above of transmitted light: R is that of the reversed pair, and
+        rounding errors are then those of the reversed pair, too, where it is nearly one.
+        """
+        k_i, k_o = self.incident, self.outgoing
         square = dr.squared_norm(self.tangent) + dr.square(self.v_z)
-        cos = 0.5 * dr.abs(square + self._excess) * dr.rsqrt(larger(square, 1e-12)) * k_i.per_inner_index
-        return k_i.sign * smaller(cos, 1)
+        per_index = dr.select(self.reflects | (k_i.sign > 0), k_i.per_inner_index, k_o.per_inner_index)
+        cos = 0.5 * dr.abs(square + k_i.sign * self._excess) * dr.rsqrt(larger(square, 1e-12)) * per_index
+        return dr.select(self.reflects, k_i.sign, 1) * smaller(cos, 1)
 
     @property
     def _excess(self) -> mi.Float:

@@ -124,7 +124,7 @@ class Grating:
     ) -> tuple[mi.UnpolarizedSpectrum, mi.Float]:
         """Evaluate f cos θ_o and the density of `sample`.
 
-        Under a coat, the transmittances of its front face are not included.
+        The transmittances of the front face of a coat and of the flat face of a sheet are not included.
 
         Args:
             si: the point, with ω_i.
@@ -187,8 +187,6 @@ class Grating:
         # Directions at angles that are not covered are black, but have a density, as they are drawn.
         within = smaller(*geometry.cosines()) >= self.min_cosine
         value = dr.select(within, value * self.theory.reflectance(si, geometry, active), 0)
-        if interface.has_flat_face:
-            value *= interface.flat_face_transmittance(wi) * interface.flat_face_transmittance(wo)
         return value, density
 
     @dr.syntax
@@ -247,7 +245,7 @@ class Grating:
         wo: mi.Vector3f,
         active: mi.Bool,
     ) -> mi.Spectrum:
-        """Return `value` as a Mueller matrix in polarised variants, with T_i T_o under a coat.
+        """Return `value` as a Mueller matrix in polarised variants, with T_i T_o of the face of a coat or sheet.
 
         It is the spectrum itself in other variants, and depolarises for materials without polarisation.
         """
@@ -257,18 +255,27 @@ class Grating:
             # Radiance scales with n².
             k_i, k_o = interface.wave_vector(si.wi), interface.wave_vector(wo)
             value *= dr.square(k_i.index / k_o.index)
-        if self.coat is None:
-            if not mi.is_polarized:
-                return value
-            return reflected(self.theory.split(value, si, self.frame(si, active), active), *directions, ctx.mode)
-        inside = [self.coat.refracted(omega) for omega in directions]
-        if mi.is_polarized:
-            value *= self.coat.absorption(inside[0].z) * self.coat.absorption(inside[1].z)
-            split = self.theory.split(value, si, self.frame(si, active), active)
-            return through_layer(split, self.coat.eta, directions, inside, ctx.mode)
-        for omega, refracted in zip(directions, inside, strict=True):
-            value *= self.coat.transmittance(omega.z, refracted.z)
-        return value
+        inside = [interface.wave_vector(omega).inner() for omega in directions]
+        if self.coat is not None:
+            for refracted in inside:
+                value *= self.coat.absorption(refracted.z)
+        if not mi.is_polarized:
+            for omega in directions:
+                value *= self._face_transmittance(omega)
+            return value
+        split = self.theory.split(value, si, self.frame(si, active), active)
+        if self.coat is None and not interface.has_flat_face:
+            return reflected(split, *directions, ctx.mode)
+        eta, has_face = interface.eta, [omega.z < 0 for omega in directions]
+        if self.coat is not None:
+            eta, has_face = self.coat.eta, [mi.Bool(True)] * 2
+        return through_layer(split, eta, directions, inside, has_face, ctx.mode)
+
+    def _face_transmittance(self, omega: mi.Vector3f) -> mi.Float:
+        """Return 1 − F of the face of a coat or sheet between the relief and a direction; one where there is none."""
+        if self.coat is not None:
+            return 1 - self.coat.reflectance(omega.z)
+        return self.interface.flat_face_transmittance(omega) if self.interface.has_flat_face else mi.Float(1.0)
 
     def _covered(self, si: mi.SurfaceInteraction3f) -> tuple[list[mi.Bool], mi.SurfaceInteraction3f]:
         """Return which of the wavelengths the spectrum and the material cover, and the point with covered ones only.

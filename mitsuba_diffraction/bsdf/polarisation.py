@@ -27,27 +27,32 @@ def reflected(split: Split, wi: mi.Vector3f, wo: mi.Vector3f, mode: mi.Transport
 
 
 def through_layer(
-    split: Split, eta: mi.Float, outside: Sequence[mi.Vector3f], inside: Sequence[mi.Vector3f], mode: mi.TransportMode
+    split: Split,
+    eta: mi.Float,
+    outside: Sequence[mi.Vector3f],
+    inside: Sequence[mi.Vector3f],
+    has_face: Sequence[mi.Bool],
+    mode: mi.TransportMode,
 ) -> mi.Spectrum:
-    """Return the Mueller matrix of a grating under a plane layer, with refraction into and out of the layer.
+    """Return the Mueller matrix of a grating in a plane layer, with refraction into and out of the layer.
 
     Args:
         split: of the grating alone, without the transmittances of the layer's face.
         eta: index of the layer, relative to the outside.
         outside, inside: (ω_i, ω_o) in the two media.
+        has_face: whether the face lies between the grating and ω_i, and ω_o.
         mode: of the transport.
     """
+
+    def face(which: int, cos: mi.Float, eta: mi.Float) -> mi.Spectrum:
+        matrix = mi.mueller.specular_transmission(mi.UnpolarizedSpectrum(dr.abs(cos)), mi.UnpolarizedSpectrum(eta))
+        return dr.select(has_face[which], matrix, mi.mueller.absorber(mi.UnpolarizedSpectrum(1)))
+
     first, last = (0, 1) if mode == mi.TransportMode.Importance else (1, 0)
     # Directions inside and outside have the same plane of refraction, and therefore the same s axis.
     across = [_across(outside[which]) for which in (first, last)]
     grating = split(inside[first], inside[last], *across)
-    entrance_face = mi.mueller.specular_transmission(
-        mi.UnpolarizedSpectrum(outside[first].z), mi.UnpolarizedSpectrum(eta)
-    )
-    exit_face = mi.mueller.specular_transmission(
-        mi.UnpolarizedSpectrum(inside[last].z), mi.UnpolarizedSpectrum(1 / eta)
-    )
-    matrix = exit_face @ grating @ entrance_face
+    matrix = face(last, inside[last].z, 1 / eta) @ grating @ face(first, outside[first].z, eta)
     source, exit_ = outside[first], outside[last]
     return mi.mueller.rotate_mueller_basis(
         matrix,
@@ -76,8 +81,10 @@ def of_facets(
     def split(source: mi.Vector3f, exit_: mi.Vector3f, source_axis: mi.Vector3f, exit_axis: mi.Vector3f) -> mi.Spectrum:
         n_i, n_o = (dr.select(omega.z > 0, 1, eta) for omega in (source, exit_))
         half = dr.normalize(n_i * source + n_o * exit_)
-        cos_half = dr.abs(dr.dot(source, half))
-        found = planes(dr.select(source.z > 0, cos_half, -cos_half), (source.z > 0) == (exit_.z > 0))
+        # The matrix of transmitted light, up to a factor, is the same from above and from below.
+        reflects = (source.z > 0) == (exit_.z > 0)
+        cos_half = dr.abs(dr.dot(dr.select(reflects | (source.z > 0), source, exit_), half))
+        found = planes(dr.select(reflects & (source.z < 0), -cos_half, cos_half), reflects)
         return _of_facet(value, found, half, source, exit_, source_axis, exit_axis)
 
     return split

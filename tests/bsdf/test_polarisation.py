@@ -114,3 +114,40 @@ def test_the_reverse_direction_has_the_transposed_matrix(polarised, parameters):
     stokes = np.concatenate([np.ones((1, 50)), stokes / np.linalg.norm(stokes, axis=0)])
     diffracted = np.einsum("ij...,jk->i...k", there, stokes)
     assert (np.linalg.norm(diffracted[1:], axis=0) <= diffracted[0] + 1e-5 * there[0, 0].max()).all()
+
+
+def powers(cosine, index):
+    """Return R_s and R_p of a dielectric, (2, n)."""
+    within = np.sqrt(1 - (1 - cosine**2) / index**2)
+    s, p = (cosine - index * within) / (cosine + index * within), (index * cosine - within) / (index * cosine + within)
+    return np.stack([s**2, p**2])
+
+
+@pytest.mark.few(1)
+@pytest.mark.parametrize("kind", ["sheet", "coat"])
+def test_faces_of_a_layer_polarise_what_the_relief_reflects_or_transmits(polarised, kind):
+    """In one plane s and p are separate: ⟨T_i R T_o⟩ over both, where unpolarised variants have ⟨T_i⟩⟨R⟩⟨T_o⟩."""
+    theta_i, theta_o = np.deg2rad([[20, 40, 60, 70, 75], [50, 30, 65, 80, 20]])
+    side = -1 if kind == "sheet" else 1
+    wi = np.stack([np.sin(theta_i), 0 * theta_i, np.cos(theta_i)])
+    wo = np.stack([-np.sin(theta_o), 0 * theta_o, side * np.cos(theta_o)])
+    if kind == "coat":
+        outer, index, parameters = 1.33, 1.5 / 1.33, {"int_ior": 1.5, "coat_ior": 1.33, "ext_ior": 1.0}
+        inside = [w[:2] / outer for w in (wi, wo)]
+        i, o = (np.concatenate([t, np.sqrt(1 - (t**2).sum(0, keepdims=True))]) for t in inside)
+        faces = [1 - powers(w[2], outer) for w in (wi, wo)]
+        cosine = np.sqrt((1 + (i * o).sum(0)) / 2)
+        facet = powers(cosine, index)
+    else:
+        index, parameters = 1.5, {"int_ior": 1.5, "ext_ior": 1.0, "transmission": "sheet"}
+        half = wi + np.concatenate([wo[:2], -np.sqrt(index**2 - (wo[:2] ** 2).sum(0, keepdims=True))])
+        cosine = np.abs((wi * half).sum(0)) / np.linalg.norm(half, axis=0)
+        faces, facet = [1 - powers(-wo[2], index)], 1 - powers(cosine, index)
+    wanted = np.prod([facet, *faces], axis=0).mean(0) / np.prod([x.mean(0) for x in (facet, *faces)], axis=0)
+    found = matrices(grating(**parameters), wi, wo)[0, 0]
+    mi.set_variant("llvm_ad_spectral")
+    unpolarised = matrices(grating(**parameters), wi, wo)
+    there = unpolarised > 1e-7
+    assert there.any(0).sum() >= 4
+    assert np.ptp(wanted) > 0.02
+    np.testing.assert_allclose((found / np.where(there, unpolarised, 1))[there], (wanted + 0 * found)[there], rtol=1e-3)
