@@ -77,6 +77,12 @@ FIGURES = (
         5,
     ),
     Figure(
+        ("compare_pigment.png",),
+        """mitsuba-diffraction compare scenes/elaphe.xml -D light=sun --pigment --no-shares --width 180 --spp 128 \
+            --shading-points 4 -o {out}/compare_pigment""",
+        2,
+    ),
+    Figure(
         ("compare_xenopeltis.png",),
         """mitsuba-diffraction compare scenes/xenopeltis.xml -D light=sun --shader flss --shader nmm --shader pq \
             --shader gem --width 180 --spp 128 --shading-points 4 -o {out}/compare_xenopeltis""",
