@@ -51,6 +51,11 @@ def whole_file(path: str | os.PathLike[str]) -> Iterator[Path]:
         try:
             yield temporary
             os.fsync(opened)
+        except OSError as error:
+            if error.errno is None or error.filename not in (None, str(temporary)):
+                raise
+            # A full disk, with the name that the caller knows.
+            raise OSError(error.errno, error.strerror, os.fspath(path)) from error
         finally:
             if fcntl is None:  # Windows renames no open file
                 os.close(opened)

@@ -157,8 +157,8 @@ class Recipe:
         path = Path(path)
         refuse_special(path)
         try:
-            with open(path, "rb") as file:
-                content = tomllib.load(file)
+            # Windows' Notepad begins a file with a mark of its byte order.
+            content = tomllib.loads(path.read_text(encoding="utf-8-sig"))
         # Syntax or encoding errors; numbers of too many digits; deeply nested brackets.
         except (ValueError, RecursionError) as error:
             raise RequestError(f"{path}: not a TOML file ({error})") from None

@@ -38,6 +38,11 @@ def write_scan(folder, seed=0, name="scan.npy"):
     return heights
 
 
+def test_a_recipe_that_windows_saved_is_read(tmp_path):
+    (tmp_path / "notepad.toml").write_bytes(b"\xef\xbb\xbf" + BLAZE.replace("\n", "\r\n").encode())
+    assert Recipe.load(tmp_path / "notepad.toml").surface == Recipe.load(write(tmp_path, BLAZE)).surface
+
+
 def powers(spectrum):
     return spectrum.table.values
 

@@ -163,10 +163,10 @@ def refuse_other_types(props: mi.Properties) -> None:
         kind, wanted, value = props.type(name), types.get(name, "float or string"), objects.get(name)
         is_base = isinstance(value, mi.BSDF) and ("BSDF" in wanted or name not in types)  # `base_from` names others
         is_texture = isinstance(value, mi.Texture) and "texture" in wanted
-        # Vectors are refused as other numbers are.
-        is_index = kind == kinds.Vector and wanted == "float or string"
+        # Vectors are refused as other numbers and names are.
+        is_vector = kind == kinds.Vector and (wanted in ("float", "float or string") or name == "material")
         is_plain = kind in (kinds.Bool, kinds.Integer, kinds.Float, kinds.String)
-        if not (is_plain or is_base or is_texture or is_index):
+        if not (is_plain or is_base or is_texture or is_vector):
             got = kind.name.lower() if value is None else type(value).__name__
             raise RequestError(f"{name}: got a {got}, wanted {wanted}")
 

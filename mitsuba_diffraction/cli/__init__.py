@@ -146,15 +146,15 @@ def _report(error: BaseException, debug: bool = False) -> int:
         traceback.print_exception(error)
     while error.__cause__ is not None and "(see above)" in str(error):  # Dr.Jit's message does not name the cause
         error = error.__cause__
+    text = str(error)
+    if isinstance(error, OSError) and error.filename and error.strerror:
+        text = f"{error.filename}: {error.strerror.lower()}"
     if isinstance(error, RequestError | FileNotFoundError | IsADirectoryError | NotADirectoryError):
-        if isinstance(error, OSError) and error.filename and error.strerror:
-            say("error", f"{error.filename}: {error.strerror.lower()}")
-        else:
-            say("error", error)
+        say("error", text)
         return 2
     if is_bug(type(error)):
-        text = error if isinstance(error, Bug) else f"{type(error).__name__}: {error}"
+        text = str(error) if isinstance(error, Bug) else f"{type(error).__name__}: {error}"
         say("error", f"this is a bug in mitsuba_diffraction ({text}); {NAME} --debug … shows where")
     else:
-        say("error", str(error) or type(error).__name__)
+        say("error", text or type(error).__name__)
     return 1

@@ -464,7 +464,7 @@ def render(
         parameters: values for the scene's `$name` parameters.
         materials: gratings that replace BSDFs, see `load_spectral_scene`.
         motion: of the camera, see `load_spectral_scene`.
-        until_error: stop when the relative error of the picture (`Accumulation.error`) is at most this; spp is then the
+        until_error: stop when the relative error of the picture (`error_of_picture`) is at most this; spp is then the
             maximum.
         checkpoint: file in which the sums are saved periodically. If it exists, rendering resumes from it. The caller
             removes it after saving the picture (`discard_checkpoints`). Large pictures have several.

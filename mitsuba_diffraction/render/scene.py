@@ -22,6 +22,7 @@ from ..bsdf.base import is_grating
 from ..bsdf.diffraction_grating import check
 from ..bsdf.light import cover_light, wavelengths_of
 from ..errors import RequestError, root_cause
+from ..files import refuse_other_than_utf8
 from ..llvm import is_supported
 from ..precomputation import is_rigorous
 from ..recipe import Recipe
@@ -349,6 +350,7 @@ def parsed(
         ValueError: if it is a folder, or parsing or the block fails, with the cause in one line.
     """
     path = Path(path)
+    refuse_other_than_utf8(os.path.realpath(path))
     if path.is_dir():
         scenes = ", ".join(sorted(file.name for file in path.glob("*.xml"))) or "none"
         raise RequestError(f"{path}: got a folder, wanted a scene (.xml); this folder holds {scenes}")

@@ -5,6 +5,7 @@ from __future__ import annotations
 import html
 import json
 import os
+import re
 from importlib import metadata
 from pathlib import Path
 from typing import Any
@@ -61,8 +62,8 @@ def page(surface: Surface, picture: NDArray[np.float16] | None = None) -> str:
         "shaders": _json(shaders),
         "data": _json(_data(surface, picture)),
     }
-    for name, part in parts.items():
-        text = text.replace("{{" + name + "}}", part)
+    # In one pass, as a part may hold what looks like the name of another.
+    text = re.sub(r"\{\{(\w+)\}\}", lambda match: parts[match[1]], text)
     if (size := len(text.encode())) > MAX_BYTES:
         raise RequestError(
             f"{surface.name}: got a page of {size / 1e6:.3g} MB, wanted at most {MAX_BYTES / 1e6:g}; a larger "
@@ -84,7 +85,8 @@ def reference_picture(path: str | os.PathLike[str]) -> NDArray[np.float16]:
 
 def _json(content: object) -> str:
     """Return JSON that may stand inside of a script element."""
-    return json.dumps(content, ensure_ascii=False, separators=(",", ":")).replace("</", "<\\/")
+    # "<!--" and "<script" would change how the rest of the page is read.
+    return json.dumps(content, ensure_ascii=False, separators=(",", ":")).replace("<", "\\u003c")
 
 
 def _data(surface: Surface, picture: NDArray[np.float16] | None) -> dict[str, Any]:

@@ -1,3 +1,4 @@
+import errno
 import os
 import stat
 
@@ -173,6 +174,12 @@ def test_a_whole_file_appears_at_the_end_only(tmp_path):
     beside = tmp_path / "beside.txt"
     beside.write_text("")
     assert stat.S_IMODE(target.stat().st_mode) == stat.S_IMODE(beside.stat().st_mode)
+
+
+def test_a_full_disk_names_the_file(tmp_path):
+    with pytest.raises(OSError, match="No space left") as found, whole_file(tmp_path / "out.html"):
+        raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+    assert found.value.filename == str(tmp_path / "out.html")
 
 
 def test_whole_file_refuses_a_folder_and_a_missing_folder(tmp_path):

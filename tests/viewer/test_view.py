@@ -1,6 +1,7 @@
 """The command `view` and `md.view`: what they write, what they refuse."""
 
 import dataclasses
+import html
 import json
 import re
 import shutil
@@ -32,6 +33,17 @@ def test_a_page_is_written_and_opened_on_request(command, tmp_path, monkeypatch)
     (tmp_path / "mine.html").write_text("my own page")
     code, _, error = command(f"view {SMALL} --no-open -o mine.html")
     assert (code, error.endswith("--overwrite replaces it\n")) == (2, True)
+
+
+@pytest.mark.parametrize("name", ["<!--<script>", "{{scripts}}", "a & b </script>"])
+def test_any_name_of_a_surface_is_only_its_name(name):
+    # Regression: the first ended the page, and the second was replaced by the program.
+    surface = Surface.named("blazed", {"depth": 0.02, "samples": 32, "coherence_length": 2.0})
+    text = pages.page(dataclasses.replace(surface, name=name))
+    assert html.unescape(re.search("<title>(.*)</title>", text)[1]) == name
+    data = re.search('<script id="data" type="application/json">(.*)</script>', text)[1]
+    assert "<" not in data
+    assert json.loads(data)["name"] == name
 
 
 @pytest.mark.slow
