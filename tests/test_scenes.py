@@ -22,6 +22,7 @@ ROOT = Path(__file__).parents[1]
 SCENES = ROOT / "scenes"
 sys.path.insert(0, str(SCENES))
 
+import anodised  # noqa: E402
 import disc  # noqa: E402
 import foil  # noqa: E402
 import ground  # noqa: E402
@@ -115,6 +116,7 @@ def small_scenes(tmp_path_factory):
     foil.make(models, count=60)
     ground.make(models, size=256)
     hologram.make(models, hologram.PICTURE, np.array(hologram.LIGHT), np.array(hologram.EYE), count=32)
+    anodised.make(models, columns=64)
     return scenes
 
 
@@ -126,6 +128,8 @@ PICTURES = [
     ("compact_disc", {"light": "sun"}),
     ("foil", {"light": "sun"}),
     ("hologram", {}),
+    ("hologram", {"card": "clear"}),
+    ("anodised", {}),
     ("rainbow", {}),
     ("window", {}),
 ]

@@ -45,7 +45,9 @@ PARAMETERS = (
     ),
     Parameter("int_ior, ext_ior", "float or string", "a dielectric, as in Mitsuba's `dielectric`", "1.5, air"),
     Parameter(
-        "material", "string", 'a conductor instead, as in Mitsuba\'s `conductor`; "none" is the perfect mirror, R = 1'
+        "material",
+        "string",
+        'a conductor instead, as in Mitsuba\'s `conductor`, or Ti; "none" is the perfect mirror, R = 1',
     ),
     Parameter("fresnel", "string", "exact, or Schlick's approximation schlick", "exact"),
     Parameter(

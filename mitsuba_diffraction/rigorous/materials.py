@@ -1,4 +1,4 @@
-"""Refractive indices n + ik, from the tables of Mitsuba's `conductor`."""
+"""Refractive indices n + ik, from the tables of Mitsuba's `conductor` and those of this package (data/ior)."""
 
 from __future__ import annotations
 
@@ -14,10 +14,11 @@ from numpy.typing import NDArray
 from ..errors import RequestError
 from ..settings import VISIBLE
 
+_OWN = Path(__file__).parents[1] / "data" / "ior"
 _SYMBOLS = {
     **{"aluminium": "Al", "aluminum": "Al", "beryllium": "Be", "chrome": "Cr", "chromium": "Cr", "copper": "Cu"},
     **{"gold": "Au", "iridium": "Ir", "mercury": "Hg", "molybdenum": "Mo", "nickel": "Ni", "niobium": "Nb"},
-    **{"rhodium": "Rh", "silver": "Ag", "tantalum": "Ta", "tungsten": "W", "vanadium": "V"},
+    **{"rhodium": "Rh", "silver": "Ag", "tantalum": "Ta", "titanium": "Ti", "tungsten": "W", "vanadium": "V"},
 }
 
 
@@ -29,8 +30,8 @@ def refractive_index(
     Args:
         wavelength: µm, in vacuum.
         int_ior: of a dielectric, or n + ik.
-        material: a conductor by Mitsuba's name ("Al", "Au", …). The tables that come with Mitsuba, linear between their
-            wavelengths and constant outside, are read without loading Mitsuba.
+        material: a conductor by Mitsuba's name ("Al", "Au", …), or "Ti". The tables, linear between their wavelengths
+            and constant outside, are read without loading Mitsuba.
         known: whether to refuse infrared and ultraviolet wavelengths outside the table.
 
     Raises:
@@ -68,11 +69,13 @@ def _near(name: str, known: list[str]) -> list[str]:
 @functools.cache
 def conductor(material: str, folder: Path) -> tuple[NDArray[np.float64], ...]:
     """Return the table of a conductor from Mitsuba's folder of indices: wavelengths in µm, n and k, (J,) each."""
-    known = sorted(path.name.removesuffix(".eta.spd") for path in folder.glob("*.eta.spd"))
+    tables = [path for at in (_OWN, folder) for path in at.glob("*.eta.spd")]
+    folders = {path.name.removesuffix(".eta.spd"): path.parent for path in tables}
+    known = sorted(folders)
     if material not in known:
         wanted = f"one of {', '.join(known) or 'none: no tables found'}"
         if near := _near(str(material), known):
             wanted = " or ".join(near)
         raise RequestError(f"material: got {material!r}, {'did you mean' if near else 'wanted'} {wanted}")
-    (nm, n), (nm_k, k) = (np.loadtxt(folder / f"{material}.{part}.spd").T for part in ("eta", "k"))
+    (nm, n), (nm_k, k) = (np.loadtxt(folders[material] / f"{material}.{part}.spd").T for part in ("eta", "k"))
     return nm * 1e-3, n, np.interp(nm, nm_k, k)

@@ -258,7 +258,7 @@ WRONG = [
     ({"material": "none"}, "thin_film_thickness: got a film on material=none"),
     ({"fresnel": "schlick"}, "fresnel: got 'schlick' with a thin film, wanted 'exact'"),
     ({"thin_film_ior": "zinc"}, "thin_film_ior: got 'zinc', wanted one of"),
-    ({"thin_film_ior": "titanium"}, "thin_film_ior: got 'titanium'"),
+    ({"thin_film_ior": "titanium"}, "thin_film_ior: got 'titanium', did you mean Ti"),
     ({"thin_film_ior": -1.0}, "thin_film_ior: got -1.0, wanted a positive index"),
     ({"thin_film_ior": True}, "thin_film_ior: got True, wanted a positive index"),
     ({"theory": "rigorous"}, "thin_film_thickness: got 0.08, wanted none with theory=rigorous"),

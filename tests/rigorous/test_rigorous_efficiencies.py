@@ -337,6 +337,11 @@ def test_indices_of_metals_agree_with_mitsuba():
         np.testing.assert_allclose([found.real, found.imag], wanted, rtol=1e-4)
 
 
+def test_the_index_of_titanium_is_that_published():
+    """At 2.26 eV, Johnson and Christy 1974, table I."""
+    assert rigorous.refractive_index(0.549, material="Ti") == pytest.approx(2.54 + 3.43j)
+
+
 @pytest.mark.parametrize(
     ("change", "message"),
     [
