@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+from typing import Any
 
 import drjit as dr
 import mitsuba as mi
@@ -77,7 +78,7 @@ def base_from(props: mi.Properties) -> Base | None:
     return Base(bsdf if isinstance(bsdf, mi.BSDF) else _diffuse(bsdf))
 
 
-def _diffuse(value: object) -> mi.BSDF:
+def _diffuse(value: Any) -> mi.BSDF:
     """Return a diffuse BSDF of a reflectance, or of a colour as of HTML, "#a0522d"."""
     if is_number(value) and 0 <= value <= 1:
         return nested_plugin("diffuse", reflectance=float(value))

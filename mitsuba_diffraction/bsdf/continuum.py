@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
+from typing import cast
+
 import drjit as dr
 import mitsuba as mi
 
 from ..grating_spectrum import GratingSpectrum
-from ..spectrum.grids import spline_weights
+from ..spectrum.grids import SplineGrid, spline_weights
+from ..spectrum.tables import SliceTable
 from .continuum_sampler import BinSampler
 from .geometry import Geometry, Incidence
 from .orders import SlicePower
@@ -24,8 +27,8 @@ class SplineSpectrum:
     resolved = False
 
     def __init__(self, spectrum: GratingSpectrum, typical_max_kappa: float | None = None) -> None:
-        grid = spectrum.grid
-        self.power = SlicePower(spectrum.table, (RIM, RIM))
+        grid = cast(SplineGrid, spectrum.grid)
+        self.power = SlicePower(cast(SliceTable, spectrum.table), (RIM, RIM))
         self.max_node_x, self.max_node_y = grid.max_order
         self.per_q_x, self.per_q_y = (opaque(1 / d) for d in grid.spacing)
         self.per_area = opaque(1 / (grid.spacing[0] * grid.spacing[1]))

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import functools
 import operator
+from collections.abc import Sequence
 
 import mitsuba as mi
 
@@ -216,8 +217,8 @@ def define() -> type:
         def traverse(self, callback: mi.TraversalCallback) -> None:
             self.layers.traverse(callback)
 
-        def parameters_changed(self, keys: list[str] = ()) -> None:
-            self.layers.grating.parameters_changed(keys)
+        def parameters_changed(self, keys: Sequence[str] = ()) -> None:
+            self.layers.grating.parameters_changed(list(keys))
 
         def eval_pdf(
             self, ctx: mi.BSDFContext, si: mi.SurfaceInteraction3f, wo: mi.Vector3f, active: mi.Bool = True

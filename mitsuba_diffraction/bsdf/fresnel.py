@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
+from typing import Any
 
 import drjit as dr
 import mitsuba as mi
@@ -25,7 +26,7 @@ class Material:
         transparent: whether transmitted light is not absorbed.
         wavelengths: range in which the reflectance is known, nm.
         model: one of `MODELS`.
-        eta: relative index of refraction; of a metal its real part, as a texture.
+        eta: relative index of refraction, a mi.Float; of a metal its real part, a mi.Texture; else None.
         outside: absolute index of the medium above, to which indices are relative.
         varies: whether the material varies over the surface.
     """
@@ -33,7 +34,7 @@ class Material:
     transparent: bool = False
     wavelengths: tuple[float, float] = (0.0, np.inf)
     model: str = "exact"
-    eta: mi.Float | mi.Texture | None = None
+    eta: Any = None
     outside: float = 1.0
     varies: bool = False
 

@@ -11,6 +11,7 @@ A few wide bins suffice: where S varies fast with κ, the mixture must cover the
 
 from __future__ import annotations
 
+import functools
 import itertools
 from collections.abc import Callable
 
@@ -57,7 +58,7 @@ def _mean_power(spectrum: GratingSpectrum, first: float, end: float) -> NDArray[
     # As a function of κ the powers have angular frequencies up to the height range.
     points = int(np.ceil((end - first) * spectrum.height_range)) + 2
     nodes = first + (np.arange(points) + 0.5) / points * (end - first)
-    total = sum(spectrum.powers(kappa).astype(np.float64) for kappa in nodes)
+    total = functools.reduce(np.add, (spectrum.powers(kappa).astype(np.float64) for kappa in nodes))
     return total / total.sum()
 
 

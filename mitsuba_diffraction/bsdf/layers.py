@@ -109,6 +109,7 @@ class Layers:
             return mi.Float(1.0 if request.grating else 0.0)
         entered = dr.mean(transmittance)
         reflected = 1 - entered
+        assert self.base is not None
         returned = entered * self.base.albedo(si, active)
         return dr.detach(dr.clip(reflected / (reflected + returned), MIN_LAYER_PROBABILITY, 1 - MIN_LAYER_PROBABILITY))
 
@@ -123,7 +124,7 @@ class Layers:
         if not rest:
             return mi.Float(1.0)
         reflected = self.grating.reflectance(si, cos, active)
-        if request.base is not None:
+        if request.base is not None and self.base is not None:
             reflected += (1 - reflected) * self.base.albedo(si, active)
         return self.coat.sampling_probability(cos, dr.mean(reflected))
 
@@ -151,7 +152,7 @@ class Layers:
             p_transmission = self._transmission_probability(si, request)
             of_grating, pdf = self.grating.evaluate(si, wo, active, wo_is_sample, p_transmission)
             value = self.grating.mueller(of_grating, ctx, si, wo, active)
-        if request.base is not None:
+        if request.base is not None and self.base is not None:
             transmittance = self.grating.transmittance(si, cos_i, active)
             p_grating = self._grating_probability(si, request, transmittance, active)
             of_base, density = self.base.bsdf.eval_pdf(request.base, si, wo, active)
@@ -233,7 +234,7 @@ class Layers:
             if not self.interface.is_sheet:
                 eta = dr.detach(self.interface.eta)
                 bs.eta = dr.select(transmitted, dr.select(cos_i > 0, eta, dr.rcp(eta)), 1)
-        if base_context is not None:
+        if base_context is not None and self.base is not None:
             rest = smaller((sample1 - p_grating) / (1 - p_grating), BELOW_ONE)
             base_sample, weight = self.base.bsdf.sample(base_context, si, rest, sample2, of_base)
             bs.wo = dr.select(of_base, base_sample.wo, bs.wo)
@@ -243,7 +244,7 @@ class Layers:
         valid = active & (bs.pdf > 0)
         # Neither the direction nor its density is differentiated by the parameters.
         result = dr.select(valid, value / dr.detach(dr.select(valid, bs.pdf, 1)), 0)
-        if base_context is not None and self.base.has_delta:
+        if base_context is not None and self.base is not None and self.base.has_delta:
             is_delta = of_base & mi.has_flag(base_sample.sampled_type, mi.BSDFFlags.Delta)
             cos_o = mi.Frame3f.cos_theta(base_sample.wo)
             base_probability = probability * (1 - p_grating)

@@ -12,6 +12,7 @@ from __future__ import annotations
 
 import itertools
 from collections.abc import Sequence
+from typing import cast
 
 import drjit as dr
 import mitsuba as mi
@@ -23,6 +24,7 @@ from ..energy.furnace import Furnace
 from ..energy.table import Layout, bounds_of, frequencies_of
 from ..geometry import fresnel
 from ..grating_spectrum import GratingSpectrum
+from ..spectrum.grids import OrderGrid
 from .geometry import Incidence, cell_of
 from .inversion import direction_bin, direction_borders, search
 from .tables import NumberTable, PacketTable, integer_part, larger, opaque
@@ -72,7 +74,7 @@ class OrderSampler:
             height_scales: factors of the heights, ascending; each interval between two of them has its own bins.
             min_lateral_scale: minimum factor of the lengths along the surface, by which heights are divided.
         """
-        grid = spectrum.grid
+        grid = cast(OrderGrid, spectrum.grid)
         self.transmits, self.is_sheet = eta is not None, is_sheet
         self.eta, self.coat_index = eta or 1.0, coat_index
         self.tile, self.max_order = np.array(grid.tile_size), np.array(grid.max_order)
@@ -83,7 +85,7 @@ class OrderSampler:
         max_phase = MAX_LINE_PHASE if 0 in grid.max_order else MAX_PHASE
         self.slices = int(np.clip(phase * coat_index / max_phase, MIN_SLICES, MAX_SLICES))
         orders = np.minimum((1 + self.eta) * self.tile * (first + last) / 2, 2 * self.max_order) + 1
-        ranges = list(itertools.pairwise(height_scales)) or [tuple(height_scales)]
+        ranges = list(itertools.pairwise(height_scales)) or [(height_scales[0], height_scales[0])]
         entries = MAX_INTERFACE_ENTRIES if self.transmits and not is_sheet else MAX_ENTRIES
         side_bins = np.sqrt(entries / (np.sqrt(len(ranges)) * self.slices * orders.prod()))
         self.side_bins = int(np.clip(side_bins, MIN_SIDE_BINS, MAX_SIDE_BINS))
@@ -101,7 +103,7 @@ class OrderSampler:
                 squares = [self._squared_powers(furnaces, above, reflects, point) for point in points]
                 powers_of_sides.append(np.sqrt(np.mean(squares, axis=0)).sum((-1, -2)).ravel())
                 for slice_ in range(self.slices):
-                    within = sum(squares[slice_ * steps : (slice_ + 1) * steps + 1])
+                    within = np.sum(squares[slice_ * steps : (slice_ + 1) * steps + 1], axis=0)
                     corner, size = self._order_ranges(above, reflects, slice_, low, high)
                     of_bins, starts = _packed_cumulative(_root_corner_sum(within), corner, size)
                     sums.append(of_bins)
@@ -233,7 +235,7 @@ class OrderSampler:
 def _root_corner_sum(at_nodes: NDArray[np.floating]) -> NDArray[np.floating]:
     """Return the root of the sum over the four corners of each bin, (rows + 1, columns + 1, …) → (bins, …)."""
     rows, columns = (n - 1 for n in at_nodes.shape[:2])
-    total = sum(at_nodes[j : j + rows, i : i + columns] for j, i in np.ndindex(2, 2))
+    total = np.sum([at_nodes[j : j + rows, i : i + columns] for j, i in np.ndindex(2, 2)], axis=0)
     return np.sqrt(total.reshape(rows * columns, *at_nodes.shape[2:]))
 
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import copy
 from collections.abc import Sequence
+from typing import cast
 
 import drjit as dr
 import mitsuba as mi
@@ -11,7 +12,7 @@ import numpy as np
 import scipy.special
 
 from ..grating_spectrum import GratingSpectrum
-from ..spectrum.grids import LobeAxis
+from ..spectrum.grids import LobeAxis, OrderGrid
 from ..spectrum.tables import HALF_SCALE, AmplitudeTable, SliceTable, shared_exponents
 from .continuum_sampler import BinSampler
 from .geometry import Geometry, Incidence
@@ -114,6 +115,7 @@ class SlicePower(_NodeTable):
         values = self._arranged(table.values)
         words = table.words_per_node
         scale = 1.0
+        packets: SharedExponentTable | HalfTable | PacketTable
         if words == 1:
             mantissas, exponents = shared_exponents(values)
             packets = SharedExponentTable(np.moveaxis(mantissas, 1, -1), exponents)
@@ -248,8 +250,9 @@ class AmplitudePower(_NodeTable):
             else:
                 low, high = (self.factors((step + k) * self.pairs + pair, active) for k in (0, 1))
                 both = [_hermite(low[k], high[k], low[k + 2], high[k + 2], coordinate) for k in (0, 1)]
-                factors = [[value for value, _ in both], [slope * self.per_x for _, slope in both]]
-            parts = []
+                (even, even_slope), (odd, odd_slope) = both
+                factors = [(even, odd), (even_slope * self.per_x, odd_slope * self.per_x)]
+            parts: list[mi.Float] = []
             for node in nodes:
                 f = sign * self.table(pair * self.nodes + node, active)
                 for even, odd in factors[: 1 + differentiate]:
@@ -290,20 +293,28 @@ class OrderSpectrum:
     scales of a scene. For overlapping orders, and for line gratings with wide lobes, it is that of `BinSampler`.
 
     Lobes of resolved orders may be scaled.
+
+    Attributes:
+        order_sampler: of resolved orders, set by `with_order_sampler`.
     """
 
+    order_sampler: OrderSampler
+
     def __init__(self, spectrum: GratingSpectrum, typical_max_kappa: float | None = None) -> None:
-        grid, sigma = spectrum.grid, spectrum.lobe_width
+        grid, sigma = cast(OrderGrid, spectrum.grid), spectrum.lobe_width
         self.axes = tuple(
             _Axis(lobe, size, max_order, sigma)
             for lobe, size, max_order in zip(spectrum.lobes, grid.tile_size, grid.max_order, strict=True)
         )
         is_line = 1 in grid.shape
         self.resolved = all(axis.count == 1 for axis in self.axes) and not (is_line and sigma > MAX_DRAWN_LOBE_WIDTH)
-        power = AmplitudePower if isinstance(spectrum.table, AmplitudeTable) else SlicePower
-        self.power = power(spectrum.table, tuple(axis.rim for axis in self.axes), windows=not self.resolved)
+        self.power: AmplitudePower | SlicePower
+        rim, windows = (self.axes[0].rim, self.axes[1].rim), not self.resolved
+        if isinstance(spectrum.table, AmplitudeTable):
+            self.power = AmplitudePower(spectrum.table, rim, windows=windows)
+        else:
+            self.power = SlicePower(spectrum.table, rim, windows=windows)
         self.q_sampler = None if self.resolved else BinSampler(spectrum, typical_max_kappa)
-        self.order_sampler: OrderSampler | None = None
         self.is_line = is_line
         self.per_width = opaque(1 / sigma)
 
@@ -350,7 +361,7 @@ class OrderSpectrum:
         lobes_x, lobes_y = self.axes[0].lobes(m_x, q.x, scale), self.axes[1].lobes(m_y, q.y, scale)
         q_sign, factor = incidence.q_sign, 1
         # Each window of orders is read at one κ: offsets of its column and row, lobes along x and y, κ.
-        if self.resolved:
+        if self.q_sampler is None:
             tangent = self._tangent(m_x, m_y, incidence.wavelength)
             factor = geometry.order_factor(tangent, incidence, per_width)
             windows = [(0, 0, lobes_x, lobes_y, geometry.order_kappa(tangent, incidence))]

@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import weakref
+from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import Any
 
 import drjit as dr
 import mitsuba as mi
@@ -97,7 +99,7 @@ class Scales:
         self.height, lateral = (VaryingNumber(props, name, 1.0) for name in ("height_scale", "lateral_scale"))
         self.lateral = lateral if lateral.varies or lateral.values[0] != 1 else None
 
-    def __iter__(self):
+    def __iter__(self) -> Iterator[VaryingNumber]:
         return iter([self.height] if self.lateral is None else [self.height, self.lateral])
 
     @property
@@ -194,7 +196,7 @@ def surface_from(props: mi.Properties, media: Media, scale: float = 1.0) -> Spec
     return _inside(props, media, scale, Recipe.of_profile(props["profile"], props, **_requested(props), **settings))
 
 
-def _requested(props: mi.Properties) -> dict[str, str | float]:
+def _requested(props: mi.Properties) -> dict[str, Any]:
     """Return the parameters of the spectrum that a scene requests; `terms` is a text where it may be "auto"."""
     given = {name: props[name] for name in REQUESTED if name in props}
     if isinstance(terms := given.get("terms"), str) and terms.isdecimal():
@@ -207,7 +209,7 @@ def _inside(props: mi.Properties, media: Media, scale: float, recipe: Recipe) ->
 
     Parameters that do not match the recipe are refused here, before a table is computed.
     """
-    settings, overrides = recipe.settings, {}
+    settings, overrides = recipe.settings, dict[str, Any]()
     if settings.theory == "rigorous":
         refuse_scalar_only(props)
         if settings.transmission != "none":
@@ -270,7 +272,7 @@ def hand_over(value: object) -> object:
     return value
 
 
-def settings_from(props: mi.Properties, coat: Coat | None) -> dict[str, str | float]:
+def settings_from(props: mi.Properties, coat: Coat | None) -> dict[str, Any]:
     """Return `material` or `int_ior` for `precompute`, the index relative to the outside.
 
     Raises:
@@ -286,9 +288,9 @@ def settings_from(props: mi.Properties, coat: Coat | None) -> dict[str, str | fl
     return {"int_ior": float(f"{eta:.6g}")}
 
 
-def settings_of_medium(media: Media) -> dict[str, str | float | bool]:
+def settings_of_medium(media: Media) -> dict[str, Any]:
     """Return the settings for `precompute` that follow from the coat, the transmission and the variant."""
-    medium = {} if media.coat is None else {"ext_ior": float(f"{media.coat.relative:.6g}")}
+    medium: dict[str, Any] = {} if media.coat is None else {"ext_ior": float(f"{media.coat.relative:.6g}")}
     if media.transmission != "none":
         medium["transmission"] = media.transmission
     return {**medium, "polarised": True} if mi.is_polarized else medium

@@ -90,7 +90,7 @@ class RigorousOrders:
         self.count = int(2 * spectrum.cutoff_sigmas * spectrum.lobe_width * axes.period) + 1  # lobes that overlap
         self.table = PacketTable(_packets(spectrum.values))
         if mi.is_polarized:
-            self.matrices = PacketTable(spectrum.mueller)
+            self.matrices = PacketTable(np.asarray(spectrum.mueller))
         self.transmits = spectrum.transmission != "none"
         self.interface = spectrum.transmission == "interface"
         self.max_order = axes.max_order
@@ -294,7 +294,7 @@ class RigorousOrders:
             count = cell + count_below
         for number, order in enumerate(orders):
             channel, channels_of_side, first = mi.UInt32(dr.select(order >= 0, 2 * order, -2 * order - 1)), cell, 0
-            if self.transmits:
+            if pair.above is not None:
                 above = dr.select(is_reversed, pair.above[1 - number], pair.above[number])
                 channels_of_side, first = dr.select(above, cell, count_below), dr.select(above, 0, cell)
             active &= channel < channels_of_side

@@ -4,12 +4,14 @@ from __future__ import annotations
 
 import threading
 import weakref
+from typing import cast
 
 import drjit as dr
 import mitsuba as mi
 import numpy as np
 
 from ..energy.table import EnergyTable
+from ..grating_spectrum import GratingSpectrum
 from ..precomputation import Spectrum
 from ..rigorous.spectrum import RigorousSpectrum
 from ..settings import VISIBLE
@@ -72,7 +74,7 @@ class SharedTables:
         key = is_sheet, coat_index, ratios.tolist(), scales.min_lateral
         with self._lock:
             if self._orders is None or self._orders[0] != key:
-                self._orders = key, OrderSampler(self._spectrum, self._eta, *key)
+                self._orders = key, OrderSampler(cast(GratingSpectrum, self._spectrum), self._eta, *key)
             return self._orders[1]
 
     def energy(self, scales: Scales) -> Energy | None:
@@ -80,7 +82,7 @@ class SharedTables:
 
         E is linear between nodes of the ratio of scales where that varies or has a gradient.
         """
-        spectrum, (low, high) = self._spectrum, scales.ratios()
+        spectrum, (low, high) = cast(GratingSpectrum, self._spectrum), scales.ratios()
         per_step = spectrum.max_kappa * spectrum.height_range / MAX_PHASE_STEP
         if low == high and not scales.height.varies and dr.grad_enabled(scales.height.value):
             # Wide enough for differences of values that are stored as bytes.

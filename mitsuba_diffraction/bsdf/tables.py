@@ -6,6 +6,8 @@ comparison and a selection take one each. Here a comparison with NaN is false.
 
 from __future__ import annotations
 
+from typing import Any
+
 import drjit as dr
 import mitsuba as mi
 import numpy as np
@@ -72,7 +74,7 @@ class PacketTable(NumberTable):
         floats = {2: mi.Vector2f, 4: mi.Vector4f}[width]
         self.packet = mi.Vector4u if packets.dtype == np.uint32 else floats
 
-    def __call__(self, index: mi.UInt32, active: mi.Bool) -> mi.Vector2f | mi.Vector4f | mi.Vector4u:
+    def __call__(self, index: mi.UInt32, active: mi.Bool | bool = True) -> Any:
         """Return the packets at `index`; zero where not `active`."""
         return dr.gather(self.packet, self.values, index, active)
 

@@ -126,21 +126,14 @@ class FilmedMaterial(Material):
 
     def __init__(self, below: Material, film: Material, thickness: VaryingNumber) -> None:
         self.below, self.film, self.thickness, self.outside = below, film, thickness, below.outside
-        self.transparent = below.transparent
+        self.transparent, self.eta, self.varies = below.transparent, below.eta, thickness.varies
         shortest, longest = zip(below.wavelengths, film.wavelengths, strict=True)
         self.wavelengths = max(shortest), min(longest)
         self._check()
 
-    @property
-    def eta(self) -> mi.Float | mi.Texture | None:
-        return self.below.eta
-
-    @property
-    def varies(self) -> bool:
-        return self.thickness.varies
-
     def update(self) -> None:
         self.below.update()
+        self.eta = self.below.eta
         self.thickness.read()
         self._check()
 
