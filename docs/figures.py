@@ -53,10 +53,10 @@ def notebook(file: str, name: str, cell: str, minutes: int) -> Figure:
     return Figure((file,), f"jupyter execute notebooks/{name}.ipynb --output={{out}}/notebook", minutes, cell=cell)
 
 
-def picture_error(scene: str, light: str) -> Figure:
+def picture_error(scene: str, light: str, options: str = "") -> Figure:
     """Return a figure of error against time of a picture."""
     file = f"picture_error_{scene.removesuffix('_sphere')}_{light}.png"
-    options = f"-D light={light} -D depth=2 -D sky=0 --width 96 --reference-spp 1024"
+    options = f"-D light={light} -D depth=2 -D sky=0 {options} --width 64 --reference-spp 1024"
     return Figure((file,), f"mitsuba-diffraction convergence scenes/{scene}.xml {options} -o {{out}}/{file}", 4)
 
 
@@ -101,8 +101,8 @@ FIGURES = (
     notebook("patch_length.png", "02_brdf_and_grating_equation", "cell-16", 6),
     picture_error("blaze", "bulb"),
     picture_error("blaze", "parallel"),
-    picture_error("xenopeltis_sphere", "bulb"),
-    picture_error("xenopeltis_sphere", "parallel"),
+    picture_error("xenopeltis_sphere", "bulb", "-D skin=xenopeltis_tile"),
+    picture_error("xenopeltis_sphere", "parallel", "-D skin=xenopeltis_tile"),
     Figure(("ready_surfaces.png",), "python precompute/contact_sheet.py {out}/ready_surfaces.png", 3),
     Figure(("removed_dust.png",), "python precompute/measured_skins.py {out}/removed_dust.png"),
     notebook("scalar_theory.png", "05_can_i_trust_the_picture", "cell-07", 3),
@@ -113,6 +113,12 @@ FIGURES = (
         2,
     ),
     notebook("slits.png", "02_brdf_and_grating_equation", "cell-14", 6),
+    Figure(
+        ("taylor_snake.png",),
+        """mitsuba-diffraction convergence scenes/xenopeltis.xml -D skin=xenopeltis_tile --terms 4,6,8,10,15,20 \
+            --width 192 --spp 32 -o {out}/taylor_snake.png""",
+        12,
+    ),
     Figure(("terms.png",), "mitsuba-diffraction benchmark --terms --plot {out}/terms.png", 10),
     Figure(("published_snakes.png",), "python docs/thesis/published_snakes.py {out}/published_snakes.png", 3),
     Figure(("thin_film.png",), "python docs/thin_film.py {out}/thin_film.png"),

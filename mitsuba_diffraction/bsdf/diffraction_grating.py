@@ -34,7 +34,7 @@ PARAMETERS = (
         "chebyshev",
     ),
     Parameter(
-        "terms", "integer or string", "number of terms of a series; auto: as many as the tolerance needs", "auto"
+        "terms", "integer or string", "number of terms of a series, or auto (default): as many as the tolerance needs"
     ),
     Parameter("heights_from", "string", "for a series, the level of h = 0: mean (default) or lowest"),
     Parameter(

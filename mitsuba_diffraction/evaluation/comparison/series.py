@@ -21,7 +21,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ...bsdf.base import contains_grating
-from ...color import XYZ_to_linear_sRGB, delta_E, into_gamut, on_screen
+from ...color import XYZ_to_linear_sRGB, delta_E, into_gamut, on_screen, spectrum_to_XYZ
 from ...errors import RequestError
 from ...grating_spectrum import GratingSpectrum
 from ...progress import Progress, no_progress
@@ -190,6 +190,7 @@ def _traced(scene: mi.Scene, samples: int) -> tuple[Picture, float]:
     clock = time.process_time if mi.variant().startswith("llvm") else time.perf_counter
     columns, rows = scene.sensors()[0].film().crop_size()
     sums, passes = Accumulation.empty(rows, columns), split(scene, samples, 2)
+    spectrum_to_XYZ(sums.radiance(), channel_wavelengths())  # loads the observer
     begin = clock()
     # Of as many samples as the others, since kernels depend on their number.
     trace_pass(scene, passes[0], 0)
