@@ -52,7 +52,7 @@ def test_the_emulated_shader_gives_the_published_map_of_elaphe_from_half_the_pix
     heights = halved(ELAPHE.recipe.height_field())
     as_published, doubled = (agreement(pixels, found) for found in shader_rgb(heights, PUBLISHED, pixels.wo, [1, 2]))
     assert as_published.correlation >= 0.99
-    assert doubled.correlation < 0.9
+    assert doubled.correlation < 0.95
     # The author's program has a brightness of 1000 unless its slider is moved.
     assert as_published.brightness == pytest.approx(1000, rel=0.3)
 

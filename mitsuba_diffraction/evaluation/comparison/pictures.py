@@ -314,16 +314,8 @@ class Pictures:
     ) -> tuple[Picture, float]:
         """Add the colours of gratings at points of the pixels to the light of all other BSDFs.
 
-        Args:
-            colour: of the gratings.
-            samples: points per pixel.
-            others: samples per pixel of all other BSDFs.
-            progress: called with (done, total).
-            brightness: of the colours; None where there is no free scale.
-            luminance: scales the colours, and their brightness, to this mean over the gratings; default: as they are.
-
-        Returns:
-            The picture, and the mean luminance of the colours over the gratings.
+        Colours and their `brightness` are scaled to a mean `luminance` over the gratings, if one is given. Returns the
+        picture and that mean; other arguments as of `shaded`.
         """
         known = (self._shader.quirks.constant_blend, self._shader.shadows, others)
         if known not in self._others:
