@@ -235,6 +235,10 @@ def define() -> type:
         ) -> mi.Float:
             return self.layers.evaluate(ctx, si, wo, active)[1]
 
+        def eval_diffuse_reflectance(self, si: mi.SurfaceInteraction3f, active: mi.Bool = True) -> mi.Spectrum:
+            albedo = self.layers.albedo(si, mi.Bool(active))
+            return mi.depolarizer(mi.Spectrum(albedo)) if mi.is_polarized else albedo
+
         def sample(
             self,
             ctx: mi.BSDFContext,

@@ -128,6 +128,24 @@ class Layers:
             reflected += (1 - reflected) * self.base.albedo(si, active)
         return self.coat.sampling_probability(cos, dr.mean(reflected))
 
+    def albedo(self, si: mi.SurfaceInteraction3f, active: mi.Bool) -> mi.UnpolarizedSpectrum:
+        """Return the reflectance of a plane of the material and of the diffuse base under it, as a guide of denoisers.
+
+        It is one where light is transmitted. Diffraction, which moves light from one direction to another, is left out.
+        """
+        cos = mi.Frame3f.cos_theta(si.wi)
+        if self.interface.transmits:
+            return mi.UnpolarizedSpectrum(1.0)
+        active &= cos > 0
+        reflected = self.grating.reflectance(si, cos, active)
+        if self.coat is not None:
+            front, transmitted = self.coat.reflectance(cos), self.coat.transmittance(cos, self.coat.cos_inside(cos))
+            reflected = front + dr.square(transmitted) * reflected
+        if self.base is not None:
+            of_base = mi.unpolarized_spectrum(self.base.bsdf.eval_diffuse_reflectance(si, active))
+            reflected += self.grating.transmittance(si, cos, active) * of_base
+        return dr.select(active, dr.clip(reflected, 0, 1), 0)
+
     def _face(self, si: mi.SurfaceInteraction3f) -> mi.Float:
         """Return F of the smooth face."""
         cos = mi.Frame3f.cos_theta(si.wi)
