@@ -3,6 +3,8 @@
 import dataclasses
 import json
 
+import drjit as dr
+import mitsuba as mi
 import numpy as np
 import pytest
 from PIL import Image
@@ -15,7 +17,9 @@ from mitsuba_diffraction.evaluation import report
 from mitsuba_diffraction.evaluation.benchmark import benchmark
 from mitsuba_diffraction.evaluation.benchmark.accuracy import Exact
 from mitsuba_diffraction.evaluation.benchmark.cases import Case, bundled_cases, scan_case
+from mitsuba_diffraction.evaluation.benchmark.measured import measured_bsdf
 from mitsuba_diffraction.evaluation.benchmark.sampling import measure
+from mitsuba_diffraction.evaluation.benchmark.speed import Rays
 from mitsuba_diffraction.settings import VISIBLE
 from mitsuba_diffraction.spectrum.tables import SliceTable
 
@@ -43,6 +47,16 @@ def test_accuracy_sees_an_error_that_is_put_in(case):
     assert found.delta_e[1] > 1
 
 
+def test_the_material_of_measured_reflects_and_is_sampled(llvm):
+    bsdf, rays = measured_bsdf(), Rays(1 << 16)
+    _, weight = bsdf.sample(mi.BSDFContext(), rays.si, rays.sample1, rays.sample2)
+    value, pdf = bsdf.eval_pdf(mi.BSDFContext(), rays.si, rays.wo)
+    # Means over uniform directions, times 2π. Those of the value and of the weights are both the albedo.
+    albedo, drawn = dr.mean(value[0])[0] * 2 * np.pi, dr.mean(pdf)[0] * 2 * np.pi
+    assert 0.1 < albedo == pytest.approx(dr.mean(weight[0])[0], rel=0.1)
+    assert 0.5 < drawn < 1.02
+
+
 @pytest.mark.slow
 def test_a_run_reports_every_combination(llvm, tmp_path):
     deep = Case("deep", gratings.sinusoidal(2.5, 2.0), "tile", 65.0)
@@ -60,6 +74,7 @@ def test_a_run_reports_every_combination(llvm, tmp_path):
     for result in results:
         assert (result.words, result.intervals > 1) == (4, True)
         assert min(result.evaluations, result.evaluate_ratio, result.read_ratio, result.sample_ratio) > 0
+        assert min(result.beside_measured) > 0
         assert result.accuracy.l1 <= 1e-2
     console = Console(width=200, record=True)
     console.print(*benchmark.tables(results, shaders, []))

@@ -49,7 +49,7 @@ class Case:
 
 
 def bundled_cases() -> list[Case]:
-    """Return analytic gratings, the synthetic skins of the recipes, and a surface of 65 µm with 512² pixels."""
+    """Return analytic gratings, the synthetic skins and the disc of the recipes, and 65 µm of skin with 512² pixels."""
     sun = SUN_COHERENCE_LENGTH
     large = gratings.xenopeltis(65.0, pixel_size=65 / 512, seed=1)
     return [
@@ -60,6 +60,8 @@ def bundled_cases() -> list[Case]:
         # Coherence as in precompute/elaphe.toml and xenopeltis.toml.
         Case("elaphe", gratings.elaphe(32.0, seed=1), "tile", 26.0),
         Case("xenopeltis", gratings.xenopeltis(32.0, seed=1), "tile", 26.0),
+        # As in precompute/compact_disc.toml.
+        Case("compact disc", gratings.compact_disc(seed=1), "tile", 26.0),
         Case("65 µm tile", large, "tile", sun),
         Case("65 µm sample", large, "sample", effective_coherence_length(large, sun)),
     ]
