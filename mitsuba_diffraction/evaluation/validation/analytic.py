@@ -89,8 +89,8 @@ def compare_orders(
             powers, kappa = order_powers(bsdf, spectrum, wi, m, wavelength)
             expected.append(closed_form(m, kappa))
             found.append(powers)
-    expected, found = np.concatenate(expected), np.concatenate(found)
-    return Record.at_max_error(expected, found, MAX_ERROR, f"{len(found)} orders, 0 to 50°, 420 to 680 nm")
+    wanted, powers = np.concatenate(expected), np.concatenate(found)
+    return Record.at_max_error(wanted, powers, MAX_ERROR, f"{len(powers)} orders, 0 to 50°, 420 to 680 nm")
 
 
 def _binary(m: Array, kappa: Array, depth: float) -> Array:

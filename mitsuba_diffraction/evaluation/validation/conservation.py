@@ -57,10 +57,8 @@ def reciprocity(spectrum: GratingSpectrum) -> Record:
         wi, wo = _near_orders(spectrum, wavelength, 4000)
         forward.append(brdf(bsdf, wi, wo, wavelength))
         reverse.append(brdf(bsdf, wo, wi, wavelength))
-    forward, reverse = np.concatenate(forward), np.concatenate(reverse)
-    return Record.at_max_error(
-        1.0, reverse / forward, 1e-4, f"f(ω_o, ω_i)/f(ω_i, ω_o), {len(forward)} pairs that the BSDF draws"
-    )
+    ratio = np.concatenate(reverse) / np.concatenate(forward)
+    return Record.at_max_error(1.0, ratio, 1e-4, f"f(ω_o, ω_i)/f(ω_i, ω_o), {len(ratio)} pairs that the BSDF draws")
 
 
 def energy(spectrum: GratingSpectrum) -> Record:

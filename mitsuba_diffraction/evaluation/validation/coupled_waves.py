@@ -185,9 +185,9 @@ def _polarisation(split: bool) -> Record:
     for case in cases():
         if case.material == "dielectric" and case.angle < 40:
             rigorous, scalar, weight = polarised_fractions(case)
-            rows.append((weight @ np.abs((scalar if split else 0.5) - rigorous), str(case)))
-    max_difference, case = max(rows)
-    note = f"mean |Δ| over orders, maximum of {len(rows)}: {case}; mean {np.mean([row[0] for row in rows]):.3f}"
+            rows.append((float(weight @ np.abs((scalar if split else 0.5) - rigorous)), str(case)))
+    max_difference, worst = max(rows)
+    note = f"mean |Δ| over orders, maximum of {len(rows)}: {worst}; mean {np.mean([row[0] for row in rows]):.3f}"
     return Record(max_difference, 0.0, 0.1 if split else None, note=note)
 
 

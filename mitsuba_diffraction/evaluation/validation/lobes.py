@@ -6,7 +6,7 @@ Wavelengths are in µm here, as in the closed forms.
 from __future__ import annotations
 
 import functools
-from typing import Any
+from typing import Any, cast
 
 import mitsuba as mi
 import numpy as np
@@ -16,6 +16,7 @@ from ... import testing
 from ...geometry import k_g
 from ...grating_spectrum import GratingSpectrum
 from ...precomputation import precompute
+from ...spectrum.grids import OrderGrid
 from ...surface.heightfield import HeightField
 
 Array = NDArray[np.float64]
@@ -39,7 +40,7 @@ def grating(spectrum: GratingSpectrum, conserve: bool = True, **parameters: Any)
 
 @functools.lru_cache(maxsize=32)
 def _built(height_field: HeightField, settings: tuple[tuple[str, Any], ...]) -> GratingSpectrum:
-    return precompute(height_field, **dict(settings))
+    return cast(GratingSpectrum, precompute(height_field, **dict(settings)))
 
 
 def spectrum_of(height_field: HeightField, **settings: Any) -> GratingSpectrum:
@@ -97,7 +98,7 @@ def orders_above(spectrum: GratingSpectrum, wi: Array, wavelength: float) -> Arr
     """Return the orders m (n, 2) of a tile at up to 80° from the normal."""
     m_x, m_y = np.meshgrid(*spectrum.grid.axes())
     m = np.stack([m_x.ravel(), m_y.ravel()], axis=-1)
-    cosines = -wavelength * m / spectrum.grid.tile_size - wi[:2]
+    cosines = -wavelength * m / np.asarray(cast(OrderGrid, spectrum.grid).tile_size) - wi[:2]
     return m[np.hypot(*cosines.T) < np.sin(np.deg2rad(80))]
 
 
@@ -105,7 +106,7 @@ def order_powers(
     bsdf: mi.BSDF, spectrum: GratingSpectrum, wi: Array, m: Array, wavelength: float
 ) -> tuple[Array, Array]:
     """Return η_m (n,) of the orders m (n, 2) by the BSDF (the power of their lobes without K and G), and their κ."""
-    q = m / np.asarray(spectrum.grid.tile_size)
+    q = m / np.asarray(cast(OrderGrid, spectrum.grid).tile_size)
     wo = towards(wi, q, wavelength)
     kappa = 2 * np.pi * (wi[2] + wo[:, 2]) / wavelength
     return lobe_powers(bsdf, spectrum, wi, q, wavelength) / k_g_between(wi, wo), kappa
