@@ -6,8 +6,9 @@ multiplied by
     E = min(e(ω_i, λ), e(ω_o, λ)),    e = 1/max(1, a)
 
 which is reciprocal, and one where a ≤ 1 for both directions. The table holds e at nodes and is linear between them.
-E is a safeguard of the model: for reliefs up to 1 µm deep, the albedo of a perfect mirror exceeds one by about a per
-cent at most.
+Where e is smaller at the centre of a grid cell than the mean of its corners, these are lowered by the difference: a
+varies fast where an order is just above the horizon, and in deep reliefs. E is a safeguard of the model; docs/plugin.md
+has measured albedos.
 
 For a line grating of period T, with c = √(1 − ω_y²) and
 
@@ -44,7 +45,6 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.ndimage import minimum_filter
 
 from ..errors import RequestError
 from ..spectrum.grids import OrderGrid
@@ -56,8 +56,7 @@ MAX_E = 1.05
 MAX_LINE_NODES = 1.2e5  # nodes of the table of a line grating, about
 MAX_NODES = 100000  # nodes of any other table
 MAX_NODE_COMPONENT_PAIRS = 3e7  # evaluations for a table with one ratio
-MIN_SLICES, MAX_SLICES = 8, 16  # nodes of 1/λ
-SLICE_PHASE = 4  # radians, by which the phase of the deepest point changes per slice added to the minimum number
+SLICES = 16  # nodes of 1/λ
 MIN_FRACTION = 1e-7  # distance of nodes from whole u and v
 MIN_T = 0.01  # t of nodes at the horizon
 
@@ -115,8 +114,7 @@ class Layout:
         frequencies = min_frequency * min(min_lateral_scale, 1), max_frequency
         if furnace.index is not None or not (isinstance(grid, OrderGrid) and 1 in grid.shape):
             nodes = min(MAX_NODE_COMPONENT_PAIRS / (len(furnace.q) * (1 if furnace.index is None else 6)), MAX_NODES)
-            slices = int(min(MIN_SLICES + _phase(furnace, frequencies) / SLICE_PHASE, MAX_SLICES))
-            return cls(0.0, 1, max(int(np.sqrt(nodes / slices)) - 1, 8), 1, slices, frequencies)
+            return cls(0.0, 1, max(int(np.sqrt(nodes / SLICES)) - 1, 8), 1, SLICES, frequencies)
         turned = grid.shape[1] == 1 and grid.shape[0] > 1
         # In about half of the unit squares 1/λ is in range.
         side = np.sqrt(2 * min(MAX_LINE_NODES, MAX_NODE_COMPONENT_PAIRS / max(len(furnace.q) / 2, 1)))
@@ -132,15 +130,33 @@ class Layout:
         """The index s_k of the unit square of each grid cell k along u or v; its nodes are k + s_k and k + s_k + 1."""
         return np.repeat(np.arange(self.squares), [self.first] + [self.cells] * (self.squares - 1))
 
+    def corners(self) -> list[tuple[Any, ...]]:
+        """Return the indices of the corners of all grid cells in an array (..., *shape), from slices to columns."""
+        start = np.arange(self.side) + self.squares_of_cells
+        count = max(self.slices - 1, 1)
+        return [
+            (..., slice(k, k + count), start[:, None] + j, start + i)
+            for k, j, i in np.ndindex(min(self.slices, 2), 2, 2)
+        ]
+
     def nodes(self) -> Real:
         """Return the coordinates of all nodes, (n, 3), in the order of `shape`, for `directions`."""
-        axis: Real = np.arange(self.shape[1], dtype=np.float64)
+        return self._points(0.0)
+
+    def centres(self) -> Real:
+        """Return the coordinates of the centres of all grid cells, likewise, (n, 3)."""
+        return self._points(0.5)
+
+    def _points(self, offset: float) -> Real:
+        """Return coordinates of points in grid cells, of the next node with `offset` 0; (n, 3)."""
+        last = 1 if offset == 0 else 0
+        slices = np.arange(self.slices + last - 1) + offset if self.slices > 1 else np.zeros(1)
+        axis = np.arange(self.first + last) + offset
         if self.lines:
             counts = [self.first] + [self.cells] * (self.squares - 1)
-            fractions = [np.linspace(0, 1, count + 1, dtype=np.float64) ** 2 for count in counts]
+            fractions = [((np.arange(count + last) + offset) / count) ** 2 for count in counts]
             axis = np.concatenate([j + f.clip(MIN_FRACTION, 1 - MIN_FRACTION) for j, f in enumerate(fractions)])
-        axes = np.arange(self.slices, dtype=np.float64), axis, axis
-        return np.stack(np.meshgrid(*axes, indexing="ij"), -1).reshape(-1, 3)
+        return np.stack(np.meshgrid(slices, axis, axis, indexing="ij"), -1).reshape(-1, 3)
 
     def directions(self, coordinates: Real, frequency: float = np.inf) -> tuple[Real, Real]:
         """Return ω (n, 3) and λ in µm (n,) at coordinates (n, 3): slice, row and column in grid cells; or 0, v and u.
@@ -203,32 +219,16 @@ class EnergyTable:
         """
         sides = [Furnace.of(spectrum, max(ratios), index, side) for side in ((1,) if index is None else (1, -1))]
         layout = Layout.of(sides[0], min_lateral_scale)
-        nodes, grid = layout.nodes(), spectrum.grid
-        used, step = np.ones(len(nodes), bool), 0
-        if layout.lines:
-            # u + v = 2cT/λ
-            used = np.floor(nodes[:, 1:]).sum(-1) < 2 * layout.period * layout.frequencies[1]
-        elif isinstance(grid, OrderGrid) and 1 in grid.shape:
-            # Symmetric along the grooves, as rows and columns are exchanged, in reverse where the grooves are along x.
-            _, row, column = nodes.T
-            step = 1 if grid.shape[0] == 1 else -1
-            used = row <= column if step == 1 else row + column <= layout.side
-        omega, wavelengths = layout.directions(nodes[used], float(np.mean(layout.frequencies)))
-        e = np.ones((len(ratios), 1 if index is None else 4, len(nodes)))
-        for k, ratio in enumerate(ratios):
-            bounds = [
-                bounds_of(dataclasses.replace(side, height_scale=ratio).albedo(omega, wavelengths / n), side.index)
-                for side, n in zip(sides, (1.0, index or 1.0), strict=False)
-            ]
-            e[k, :, used] = np.concatenate(bounds).T
-        e = e.reshape(*e.shape[:2], *layout.shape)
-        if step:
-            e = np.where(used.reshape(layout.shape), e, e[..., ::step, ::step].swapaxes(-1, -2))
-        if _phase(sides[0], layout.frequencies) > (MAX_SLICES - MIN_SLICES) * SLICE_PHASE:
-            # For so deep a relief e varies faster than the nodes resolve: each node gets the minimum over its
-            # neighbours, rounded down.
-            e = minimum_filter(e, (1, 1, 3, 3, 3)) - 0.5 * MAX_E / 255
-        values = np.rint(np.clip(e, 0, MAX_E) * (255 / MAX_E)).astype(np.uint8)
+        e = _bounds(layout, sides, ratios, layout.nodes()).reshape(len(ratios), -1, *layout.shape)
+        # e varies fast where an order is just above the horizon, and in deep reliefs: where it is less at the centre of
+        # a grid cell than between the corners, they are lowered by the difference.
+        corners = layout.corners()
+        of_centres = _bounds(layout, sides, ratios, layout.centres()).reshape(e[corners[0]].shape)
+        excess = np.where(of_centres < 1, np.mean([e[corner] for corner in corners], axis=0) - of_centres, 0)
+        lowered = e.copy()
+        for corner in corners:
+            lowered[corner] = np.minimum(lowered[corner], e[corner] - np.maximum(excess, 0))
+        values = np.rint(np.clip(lowered, 0, MAX_E) * (255 / MAX_E)).astype(np.uint8)
         return cls(layout, values, tuple(ratios))
 
     @property
@@ -271,10 +271,30 @@ class EnergyTable:
         return cls(layout, np.frombuffer(content, np.uint8).reshape(1, 1, *layout.shape))
 
 
-def _phase(furnace: Furnace, frequencies: tuple[float, float]) -> float:
-    """Return the difference of the phases of the deepest point at two 1/λ, in the denser medium, in radians."""
-    height = furnace.spectrum.height_range * furnace.height_scale * max(furnace.index or 1, 1)
-    return 4 * np.pi * height * (frequencies[1] - frequencies[0])
+def _bounds(layout: Layout, sides: Sequence[Furnace], ratios: Sequence[float], points: Real) -> Real:
+    """Return e at coordinates of nodes or centres of a layout, (ratios, channels, n)."""
+    used, step, grid = np.ones(len(points), bool), 0, sides[0].spectrum.grid
+    if layout.lines:
+        # u + v = 2cT/λ
+        used = np.floor(points[:, 1:]).sum(-1) < 2 * layout.period * layout.frequencies[1]
+    elif isinstance(grid, OrderGrid) and 1 in grid.shape:
+        # Symmetric along the grooves, as rows and columns are exchanged, in reverse where the grooves are along x.
+        _, row, column = points.T
+        step = 1 if grid.shape[0] == 1 else -1
+        used = row <= column if step == 1 else row + column <= layout.side
+    omega, wavelengths = layout.directions(points[used], float(np.mean(layout.frequencies)))
+    e = np.ones((len(ratios), sum(len(side.branches[:2]) for side in sides), len(points)))
+    for k, ratio in enumerate(ratios):
+        bounds = [
+            bounds_of(dataclasses.replace(side, height_scale=ratio).albedo(omega, wavelengths / n), side.index)
+            for side, n in zip(sides, (1.0, sides[0].index or 1.0), strict=False)
+        ]
+        e[k, :, used] = np.concatenate(bounds).T
+    if step:
+        side = len(np.unique(points[:, 1]))
+        mirrored = e.reshape(*e.shape[:2], -1, side, side)[..., ::step, ::step].swapaxes(-1, -2)
+        e = np.where(used, e, mirrored.reshape(e.shape))
+    return e
 
 
 def frequencies_of(spectrum: PowerSpectrum, index: float | None) -> tuple[float, float]:

@@ -145,6 +145,14 @@ def test_no_albedo_of_a_named_surface_is_above_one(name):
     assert (lower_bound > 1.01).sum() <= 1
 
 
+@pytest.mark.slow
+def test_no_albedo_of_ridges_is_above_one():
+    # Regression: 1.19 at 75°, 1.08 at 70° and 1.03 at 60°, between nodes of the table.
+    bsdf = mi.load_dict({"type": "diffraction_grating", "profile": "morpho_ridges", "material": "none"})
+    mean, error = albedos(bsdf, testing.direction([75, 70, 60, 80], [61, 61, 45, 61]), np.full(4, 680.0), 1 << 15)
+    assert (mean - 3 * error).max() <= 1.01
+
+
 @pytest.mark.parametrize("height_scale", [0.3, 0.7])
 def test_no_albedo_above_one_for_scaled_heights(height_scale):
     omega, wavelengths = random_directions(np.random.default_rng(2), 12)
