@@ -1,12 +1,13 @@
 """The far field of a relief of square texels, its distance from the wanted one, and the gradient of that.
 
-z = U h Uᵀ                                   heights of the pixels, from those of the texels, h (`blurred_texels`)
-η_m = |F_m|²,  F = fft2(e^{iκz})/N           power of each order, for light along the normal
-P = A_y η A_xᵀ                               power in each bin of direction cosines
-L = Σ (P − t)²/Σ t²                          t the wanted fraction of the light, Σ over bins and wavelengths
+    z = U h Uᵀ                                   heights of the pixels, from those of the texels, h (`blurred_texels`)
+    η_m = |F_m|²,  F = fft2(e^{iκz})/N           power of each order, for light along the normal
+    P = A_y η A_xᵀ                               power in each bin of direction cosines (`lobes_in_bins`)
+    L = Σ (P − t)²/Σ t²                          t the wanted fraction of the light, Σ over bins and wavelengths
 
-∂L/∂P = 2 (P − t)/Σ t²,    g = A_yᵀ ∂L/∂P A_x
-∂L/∂z = 2 Re[conj(iκ e^{iκz}) · ifft2(g F)],    ∂L/∂h = Uᵀ ∂L/∂z U
+    ∂L/∂P (`squared_difference`),   ∂L/∂z (`phase_gradient`) with g = A_yᵀ ∂L/∂P A_x,   ∂L/∂h = Uᵀ ∂L/∂z U
+
+The constraints are `bounds` of the heights and `nearest_levels`.
 """
 
 from __future__ import annotations
@@ -78,16 +79,28 @@ class FarField:
 
     def loss(self, heights: Array) -> tuple[float, Array]:
         """Return L and ∂L/∂h, (texels, texels) 1/µm, at the heights h of the texels in µm."""
-        z, total, gradient = self.relief(heights), 0.0, 0.0
-        scale = 1 / (self.wanted**2).sum()
+        z, total = self.relief(heights), 0.0
+        gradient = np.zeros(z.shape)
         for kappa, lobes, wanted in zip(self.kappa, self.lobes, self.wanted, strict=True):
             wave = np.exp(1j * kappa * z)
             amplitudes = scipy.fft.fft2(wave, norm="forward")
-            difference = lobes @ (amplitudes.real**2 + amplitudes.imag**2) @ lobes.T - wanted
-            total += scale * (difference**2).sum()
-            g = lobes.T @ (2 * scale * difference) @ lobes
-            gradient = gradient + 2 * kappa * (np.conj(1j * wave) * scipy.fft.ifft2(g * amplitudes)).real
-        return float(total), self.texels.T @ gradient @ self.texels
+            predicted = lobes @ (amplitudes.real**2 + amplitudes.imag**2) @ lobes.T
+            value, of_predicted = squared_difference(predicted, wanted)
+            total += value
+            gradient += phase_gradient(wave, amplitudes, kappa, lobes.T @ of_predicted @ lobes)
+        scale = (self.wanted**2).sum()
+        return total / scale, self.texels.T @ gradient @ self.texels / scale
+
+
+def squared_difference(predicted: Array, wanted: Array) -> tuple[float, Array]:
+    """Return Σ (P − t)² and its gradient 2 (P − t) with respect to P."""
+    difference = predicted - wanted
+    return float((difference**2).sum()), 2 * difference
+
+
+def phase_gradient(wave: NDArray[np.complex128], amplitudes: NDArray[np.complex128], kappa: float, g: Array) -> Array:
+    """Return ∂L/∂z = 2 Re[conj(iκ e^{iκz}) · ifft2(g F)] from e^{iκz}, F and g = ∂L/∂η, all of one shape."""
+    return 2 * kappa * (np.conj(1j * wave) * scipy.fft.ifft2(g * amplitudes)).real
 
 
 def nearest_levels(heights: Array, height_range: float, levels: int) -> Array:

@@ -23,6 +23,7 @@ if TYPE_CHECKING:
 
 SUFFIXES = (".gsf", ".tif", ".toml", ".png")
 _IMAGE_DESCRIPTION = 270  # tag of TIFF
+_RECIPE_TOLERANCE = 0.01  # of the recipe; finer tables take minutes, for differences that no picture shows
 _COLOUR_WAVELENGTHS = 41
 _PLOTTED_WAVELENGTHS = np.arange(400.0, 701.0, 10.0)  # nm
 
@@ -50,7 +51,7 @@ def save(design: Design, path: str | os.PathLike[str]) -> tuple[Path, ...]:
     with whole_file(paths[2]) as temporary:
         temporary.write_text(
             f'# {MARK}: {field.source}\n[surface]\nscan = "{paths[0].name}"\n\n[spectrum]\nextent = "tile"\n'
-            f"coherence_length = {plate.coherence_length:.6g}\n",
+            f"coherence_length = {plate.coherence_length:.6g}\ntolerance = {_RECIPE_TOLERANCE}\n",
             encoding="utf-8",
         )
     save_picture(design, paths[3])
