@@ -88,6 +88,7 @@ FIGURES = (
             --shader gem --width 180 --spp 128 --shading-points 4 -o {out}/compare_xenopeltis""",
         5,
     ),
+    Figure(("design.png",), "mitsuba-diffraction design precompute/designed/cat.png -o {out}/design.gsf"),
     Figure(
         ("efficiencies.png",),
         """mitsuba-diffraction efficiency ruled,lines_per_mm=1200 --theory rigorous --material Al --angle 17.5 \

@@ -44,7 +44,7 @@ def llvm():
 
 
 @pytest.mark.few(1)
-@pytest.mark.parametrize("name", ["blaze", "elaphe", "screen", "xenopeltis", "xenopeltis_sphere"])
+@pytest.mark.parametrize("name", ["blaze", "elaphe", "projection", "screen", "xenopeltis", "xenopeltis_sphere"])
 def test_scene_renders(llvm, name):
     check(render(SCENES / f"{name}.xml", spp=4, width=16, height=16), 16, 16)
 
