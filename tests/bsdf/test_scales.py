@@ -204,10 +204,10 @@ def test_recipes_and_profiles_are_built_for_the_scales(llvm):
 @pytest.mark.parametrize(
     ("parameters", "message"),
     [
-        ({"lateral_scale": [[0.5, 1.25]]}, "lateral_scale: got 1.25, wanted .* up to 1: .* 360 nm; .* here 288 nm"),
+        ({"lateral_scale": [[0.5, 1.25]]}, "lateral_scale: got 1.25, wanted 0.01 to 1: .* 360 nm; .* here 288 nm"),
         ({"height_scale": [[0.5, 1.25]]}, "height_scale: got 1.25, wanted 0 to 1: .* here 288 nm"),
         ({"height_scale": [[-0.5, 0.5]]}, "height_scale: got -0.5, wanted 0 to 1"),
-        ({"lateral_scale": [[0.0, 0.5]]}, "lateral_scale: got 0, wanted more than 0"),
+        ({"lateral_scale": [[0.0, 0.5]]}, "lateral_scale: got 0, wanted 0.01 to 1"),
         ({"lateral_scale": [[np.nan, 0.5]]}, "lateral_scale: got values that are not finite"),
         ({"lateral_scale": "a"}, "lateral_scale: got 'a', wanted a number or the file of a picture"),
         ({"lateral_scale": {"type": "mesh_attribute", "name": "vertex_s"}}, "MeshAttribute, whose range is not known"),

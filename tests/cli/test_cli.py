@@ -271,7 +271,7 @@ def test_the_version_is_printed(command):
 
 
 def test_help_shows_the_defaults(command):
-    for words in (("precompute", "default: auto"), ("precompute", "default: 0.001"), ("render", "or 64")):
+    for words in (("precompute", "default: auto"), ("precompute", "default: 0.01"), ("render", "or 64")):
         code, out, _ = command(words[0], "--help")
         assert code == 0
         assert words[1] in " ".join(re.sub(r"[│|]", " ", out).split())

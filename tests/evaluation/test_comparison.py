@@ -283,10 +283,10 @@ def test_brightness_is_fitted_to_the_diffraction_of_this_model(llvm, tmp_path, p
 
 def test_a_crop_window_is_compared_alone(llvm, tmp_path):
     scene = write(tmp_path / "scene.xml")
-    whole = Pictures(scene, "gem")
+    whole = Pictures(scene, "gem", brightness=1000)  # not the one found from the pixels
     window = '<integer name="crop_offset_x" value="4"/><integer name="crop_width" value="8"/>'
     scene.write_text(scene.read_text().replace('<integer name="width"', window + '<integer name="width"'))
-    cropped = Pictures(scene, "gem")
+    cropped = Pictures(scene, "gem", brightness=1000)
     assert cropped.film_size == (16, 12)
     np.testing.assert_array_equal(cropped.surface, whole.surface[:, 4:12])
     pair = [pictures.shaded((), 256, 64).xyz for pictures in (cropped, whole)]

@@ -122,9 +122,9 @@ def test_light_of_bands_is_that_of_the_whole_bit_for_bit(three_bands):
 
     alone, light = LightAlone(mi.Properties()), LightOfBands(bands)
     for seed in (1, 2):
-        whole = trace_pass(built, 64, seed, alone)[..., :-1]
+        whole = trace_pass(built, 256, seed, alone)[..., :-1]
         assert (whole.sum((1, 2)) > 0).sum() > 5
-        banded = np.concatenate([trace_pass(built, 64, seed, alone, band, light) for band in bands])
+        banded = np.concatenate([trace_pass(built, 256, seed, alone, band, light) for band in bands])
         np.testing.assert_array_equal(banded[..., :-1], whole)
 
 

@@ -74,7 +74,9 @@ def with_light_from_gratings(scene):
 @pytest.mark.parametrize("processes", [1, 2], indirect=True)
 def test_a_cluster_gives_the_bits_of_one_machine(scene, processes, command):
     Path("scene.xml").write_text(scene)
-    line = f"render scene.xml -o out.exr --spp 9 --variant llvm_ad_spectral --dask {processes.scheduler_address}"
+    line = (
+        f"render scene.xml -o out.exr --float --spp 9 --variant llvm_ad_spectral --dask {processes.scheduler_address}"
+    )
     code, _, err = command(line)
     assert (code, err) == (0, "")
     here = render("scene.xml", spp=9)

@@ -550,7 +550,7 @@ def test_the_orbit_takes_any_xml_that_mitsuba_takes():
 
 
 def test_a_turntable_writes_frames_and_an_animation_and_resumes(command, monkeypatch):
-    line = f"{RENDER} -o out.exr --frames 3 --orbit --spp 2"
+    line = f"{RENDER} -o out.exr --float --frames 3 --orbit --spp 2"
     press_ctrl_c(monkeypatch, 3)
     code, _, err = command(line)
     assert code == 130
