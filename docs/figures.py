@@ -91,8 +91,8 @@ FIGURES = (
     Figure(("design.png",), "mitsuba-diffraction design precompute/designed/cat.png -o {out}/design.gsf"),
     Figure(
         ("projection.png",),
-        """mitsuba-diffraction render scenes/projection.xml --width 480 --height 270 --spp 32 --exposure 10.3 --denoise \
-            -o {out}/projection.exr""",
+        """mitsuba-diffraction render scenes/projection.xml --width 480 --height 270 --spp 32 --exposure 10.3 \
+            --denoise -o {out}/projection.exr""",
         2,
     ),
     Figure(
