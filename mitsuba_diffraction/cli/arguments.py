@@ -127,7 +127,7 @@ def materials_of(texts: Sequence[str] | None) -> dict[str, dict[str, Value]]:
         is_file = Path(source).suffix.lower() in (".toml", ".exr")
         if is_file and not os.path.isfile(source):
             raise FileNotFoundError(f"{source}: no such file")
-        if _is_film(source) and values.keys().isdisjoint(("transmission", "material", "coat_ior", "base")):
+        if is_film(source) and values.keys().isdisjoint(("transmission", "material", "coat_ior", "base")):
             values["transmission"] = "sheet"
             say("note", f"material {name}: {source} transmits light (transmission=sheet); transmission=none does not")
         # Absolute, as file names in a scene are relative to the folder of the scene.
@@ -135,7 +135,7 @@ def materials_of(texts: Sequence[str] | None) -> dict[str, dict[str, Value]]:
     return materials
 
 
-def _is_film(source: str) -> bool:
+def is_film(source: str) -> bool:
     """Return whether a profile, or that of a recipe, is a transparent film."""
     profile = Recipe.load(source).surface.get("profile", "") if source.lower().endswith(".toml") else source
     return profile == "film" or profile.startswith("transmission_")

@@ -12,13 +12,14 @@ import typer
 
 from ..files import whole_file
 from ..outputs import check_outputs
-from ..progress import NAME, progress_bar, tell
+from ..progress import NAME, progress_bar, say, tell
 from ..viewer.page import page, reference_picture
 from ..viewer.surface import Surface
 from .arguments import (
     SCAN_OPTIONS,
     Overwrite,
     check_suffix,
+    is_film,
     is_scan,
     options_of_scan,
     recipe_of,
@@ -64,8 +65,12 @@ def view(
     else:
         spectrum = f"{path.stem}.exr"
         options = _given(context) + (["--extent", "sample"] if of_a_scan and "extent" not in settings else [])
-        command = shlex.join([NAME, "precompute", str(path.resolve()), *options, "-o", spectrum])
+        command = shlex.join([NAME, "precompute", path.name, *options, "-o", spectrum])
         surface = Surface.of_recipe(recipe, path.stem, {"filename": spectrum}, parameters, progress, command)
+    if is_film(name):
+        say(
+            "note", f"{name}: the page shows the light that it reflects; `render` shows the light that a film transmits"
+        )
     text = page(surface, picture)
     with whole_file(target) as temporary:
         temporary.write_text(text, encoding="utf-8")

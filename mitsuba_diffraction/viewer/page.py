@@ -25,7 +25,7 @@ from .arrays import encoded
 from .coil import coil
 from .surface import Surface
 
-MAX_BYTES = 5_000_000  # of a page
+MAX_BYTES = 6_000_000  # of a page
 MAX_HEIGHTS_SIDE = 512  # pixels of the heights for the shader of 2014
 
 SHORTEST_SHOWN = 380.0  # nm, of the wavelengths that a page shows
@@ -33,6 +33,8 @@ NODES_AT_ONCE = 8  # the most along one axis that contribute at one q, as MAX_LO
 
 METALS = ("Al", "Ag", "Au", "Cr", "Cu", "W")
 """The conductors among which a page chooses, besides that of the surface."""
+
+_SKINS = ("elaphe", "xenopeltis")  # profiles
 
 _ASSETS = Path(__file__).parent / "assets"
 _STYLES = ("page.css",)
@@ -92,6 +94,8 @@ def _json(content: object) -> str:
 def _data(surface: Surface, picture: NDArray[np.float16] | None) -> dict[str, Any]:
     return {
         "name": surface.name,
+        "summary": _summary(surface),
+        "shape": _shape(surface),
         "source": surface.spectrum.source,
         "version": metadata.version("mitsuba_diffraction"),
         "grating": dict(surface.grating),
@@ -104,6 +108,24 @@ def _data(surface: Surface, picture: NDArray[np.float16] | None) -> dict[str, An
         "heights": _heights(surface),
         "picture": None if picture is None else encoded(picture),
     }
+
+
+def _summary(surface: Surface) -> str:
+    """Return what the surface is, in one line."""
+    if surface.recipe is None:
+        return f"Saved spectrum, coherence length {surface.spectrum.coherence_length:.3g} µm."
+    field = surface.recipe.height_field()
+    size = " × ".join(f"{length:.3g}" for length in field.tile_size[: 2 if field.shape[0] > 1 else 1])
+    kind = "Period" if surface.recipe.settings.extent == "tile" else "Sample of an irregular surface,"
+    return f"{kind} {size} µm, {field.height_range:.3g} µm deep."
+
+
+def _shape(surface: Surface) -> str:
+    """Return the object that is shown first: the snake for skins and samples of other irregular surfaces."""
+    if surface.material.orientation in FROM_RADIUS:
+        return "plate"
+    profile = None if surface.recipe is None else surface.recipe.surface.get("profile")
+    return "coil" if surface.spectrum.extent == "sample" or profile in _SKINS else "sphere"
 
 
 def _material(surface: Surface) -> dict[str, Any]:

@@ -69,7 +69,7 @@ class Surface:
         name: its title.
         spectrum: S(q; κ) as slices.
         recipe: of the heights; None for a saved spectrum.
-        grating: the surface as parameters of `diffraction_grating`.
+        grating: the surface as parameters of `diffraction_grating`; files by their names, without folders.
         material: its material.
         command: that makes the file of `grating`, if it is not there yet.
     """
@@ -155,10 +155,10 @@ class Surface:
         path, values = Path(source), dict(parameters)
         if path.suffix.lower() == ".exr":
             material = material_from(values)
-            return cls(path.stem, load_spectrum(path), None, {"filename": str(path.resolve())}, material)  # type: ignore[arg-type]
+            return cls(path.stem, load_spectrum(path), None, {"filename": path.name}, material)  # type: ignore[arg-type]
         if path.suffix.lower() == ".toml":
             recipe = Recipe.load(path)
-            return cls.of_recipe(recipe, path.stem, {"filename": str(path.resolve())}, values, progress=progress)
+            return cls.of_recipe(recipe, path.stem, {"filename": path.name}, values, progress=progress)
         name = os.fspath(source)
         if name not in PROFILES:
             raise RequestError(

@@ -105,7 +105,7 @@ def test_values_are_those_of_the_bsdf(source, parameters, changes, opened, llvm)
     surface = Surface.named(RECIPES / source, parameters)
     pairs = pairs_of(surface.spectrum)
     tab = opened(surface)
-    tab.evaluate("(changes) => viewer.set(changes)", {"maxFrames": 1, **changes})
+    tab.evaluate("(changes) => viewer.set(changes)", {"maxFrames": 1, "hasBase": False, **changes})
     values = call(tab, "viewer.evaluate", pairs.ravel().tolist())
     base = {}
     if changes:
@@ -113,7 +113,10 @@ def test_values_are_those_of_the_bsdf(source, parameters, changes, opened, llvm)
         linear = [c / 12.92 if c <= 0.04045 else ((c + 0.055) / 1.055) ** 2.4 for c in pigment]
         base = {"base": {"type": "diffuse", "reflectance": {"type": "rgb", "value": linear}}}
     bsdf = mi.load_dict(
-        {"type": "diffraction_grating", **surface.grating, **parameters, **base, "conserve_energy": False}
+        {
+            **{"type": "diffraction_grating", "filename": str(RECIPES / source), "conserve_energy": False},
+            **{**parameters, **base},
+        }
     )
     wanted = testing.evaluate(bsdf, pairs[:, :3], pairs[:, 3:6], pairs[:, 6:])[:, 0]
     assert (wanted > 1e-3 * wanted.max()).mean() > 0.1
@@ -189,7 +192,7 @@ def test_a_drag_changes_the_picture_and_nothing_leaves_the_page(opened):
     before = tab.evaluate("viewer.state")
     box = tab.locator("#canvas").bounding_box()
     pictures = [tab.screenshot()]
-    for modifier, name in ((None, "lightAzimuth"), ("Shift", "azimuth")):
+    for modifier, name in ((None, "azimuth"), ("Shift", "lightAzimuth")):
         if modifier:
             tab.keyboard.down(modifier)
         tab.mouse.move(box["x"] + 100, box["y"] + 80)
@@ -202,6 +205,34 @@ def test_a_drag_changes_the_picture_and_nothing_leaves_the_page(opened):
         pictures.append(tab.screenshot())
     tab.keyboard.up("Shift")
     assert len(set(pictures)) == 3
+    before = tab.evaluate("viewer.state")
+    lamp = tab.locator("#lamp").bounding_box()
+    tab.mouse.move(lamp["x"] + 13, lamp["y"] + 13)
+    tab.mouse.down()
+    tab.mouse.move(lamp["x"] + 43, lamp["y"] + 13, steps=2)
+    tab.mouse.up()
+    after = tab.evaluate("viewer.state")
+    assert after["lightAzimuth"] > before["lightAzimuth"]
+    assert after["azimuth"] == before["azimuth"]
+    tab.locator("#reset").click()
+    assert tab.evaluate("viewer.state.azimuth") == -90
+    with tab.expect_download() as saved:
+        tab.locator("#save").click()
+    assert saved.value.suggested_filename == "blazed.png"
+
+
+def test_the_scene_of_a_view_has_file_names_without_folders(opened):
+    surface = Surface.named(RECIPES / "blaze.toml", {"material": "Al"})
+    tab = opened(surface)
+    tab.evaluate("viewer.set({ maxFrames: 1 })")
+    with tab.expect_download() as saved:
+        tab.locator("#copy").click()
+    scene = saved.value.path().read_text()
+    assert 'name="filename" value="blaze.toml"' in scene
+    assert scene == tab.evaluate("viewer.scene()")
+    assert tab.evaluate("viewer.command()") == "mitsuba-diffraction render view.xml --spp 64\n"
+    assert str(RECIPES.parent) not in tab.content()
+    assert tab.locator("#summary").inner_text() == "Period 2.5 µm, 0.246 µm deep."
     assert tab.messages == [tab.url[:80]]
 
 
@@ -253,10 +284,11 @@ def test_the_axes_of_the_pattern_are_those_of_the_plugin(orientation, opened, ll
     grating = {"type": "diffraction_grating", "profile": "blazed", **parameters, "orientation": orientation}
     for name, kind in (("sphere", "sphere"), ("plate", "rectangle"), ("disc", "disk")):
         tab.evaluate("(shape) => viewer.set({ shape, maxFrames: 1, azimuth: -60, elevation: 50 })", name)
-        scene = tab.evaluate("viewer.command()").partition("<<'END'\n")[2].partition("END")[0]
+        scene = tab.evaluate("viewer.scene()")
         assert f'name="orientation" value="{orientation}"' in scene
         width, height = tab.evaluate("[viewer.renderer.width, viewer.renderer.height]")
-        light = testing.direction(90 - 51.7, -50.7)
+        azimuth, elevation = tab.evaluate("[viewer.state.lightAzimuth, viewer.state.lightElevation]")
+        light = testing.direction(90 - elevation, azimuth)
         sensor = mi.load_string(
             re.search("<sensor.*?</sensor>", scene, re.DOTALL)[0].replace("<sensor", '<sensor version="3.0.0"', 1)
         )
@@ -282,14 +314,14 @@ def test_the_copied_scene_renders_the_same_picture(opened, tmp_path, llvm):
     tab.evaluate(
         "(size) => { const canvas = document.getElementById('canvas');"
         " Object.assign(canvas.style, { width: `${size.width}px`, height: `${size.height}px`, inset: 'auto' });"
-        " viewer.set({ maxFrames: 32, lightWidth: 0, lightLength: 0, sky: 0 }); }",
+        " viewer.set({ maxFrames: 32, lightWidth: 0, lightLength: 0, sky: 0, shape: 'sphere', hasBase: false }); }",
         size,
     )
     while tab.evaluate("viewer.renderer.width !== 64"):
         tab.wait_for_timeout(50)
     wait_for_frames(tab)
-    scene = tab.evaluate("viewer.command()").partition("<<'END'\n")[2].partition("END")[0]
-    (tmp_path / "view.xml").write_text(scene)
+    scene = tab.evaluate("viewer.scene()")
+    (tmp_path / "view.xml").write_text(scene.replace("elaphe_afm.toml", str(RECIPES / "elaphe_afm.toml")))
     image = render(tmp_path / "view.xml", spp=256)
     wanted = spectrum_to_XYZ(image.radiance, image.wavelengths)
     found = np.array(tab.evaluate("Array.from(viewer.renderer.readMean().values)")).reshape(64, 64, 4)[::-1]

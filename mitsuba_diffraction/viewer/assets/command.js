@@ -57,15 +57,17 @@ ${note}  <integrator type="path"><integer name="max_depth" value="2"/></integrat
 </scene>`;
 }
 
-function commandOf(data, state, coil) {
-  const examples = state.shape in ANALYTIC ? "" : "mitsuba-diffraction examples\n";
-  return `${data.command ? `${data.command}\n` : ""}${examples}cat > view.xml <<'END'\n${sceneOf(data, state, coil)}\nEND\nmitsuba-diffraction render view.xml --spp 64\n`;
+// The same words in bash and PowerShell.
+function commandOf(data, state) {
+  const examples = state.shape in ANALYTIC ? [] : ["mitsuba-diffraction examples"];
+  return [...(data.command ? [data.command] : []), ...examples, "mitsuba-diffraction render view.xml --spp 64", ""].join("\n");
 }
 
 function copyCommand(data, state, coil) {
-  const text = commandOf(data, state, coil);
-  $("command").value = text;
+  download("view.xml", new Blob([sceneOf(data, state, coil)], { type: "text/xml" }));
+  const text = commandOf(data, state);
+  const file = data.grating.filename && !data.command ? `In a folder with ${data.grating.filename} and view.xml:\n` : "In the folder of view.xml:\n";
+  $("command").value = file + text;
   $("command").hidden = false;
-  $("command").select();
   navigator.clipboard?.writeText(text).catch(() => {});
 }

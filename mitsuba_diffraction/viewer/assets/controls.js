@@ -41,9 +41,12 @@ class Controls {
       box.addEventListener("input", () => this.set({ quirks: { ...this.state.quirks, [name]: box.checked } }));
     }
     this.followDivider($("divider"));
-    for (const button of document.querySelectorAll("[name=drag]")) {
-      button.addEventListener("input", () => this.set({ drag: button.value }));
-    }
+    $("lamp").addEventListener("pointerdown", (event) => $("lamp").setPointerCapture(event.pointerId));
+    $("lamp").addEventListener("pointermove", (event) => {
+      if (event.buttons) this.moveLight(0.4 * event.movementX, 0.4 * event.movementY);
+    });
+    $("lamp").addEventListener("keydown", (event) => this.key(event, true));
+    $("close").addEventListener("click", () => { $("picked").hidden = true; });
     for (const [name, action] of Object.entries(actions)) $(name).addEventListener("click", action);
     this.followPointers($("canvas"));
     $("canvas").addEventListener("keydown", (event) => this.key(event));
@@ -85,7 +88,6 @@ class Controls {
     $("right-name").textContent = isShader ? `${state.right.toUpperCase().replace("_", " with ")}, 2014` : "reference";
     $("divider").style.left = `${100 * state.divider}%`;
     $("divider").setAttribute("aria-valuenow", Math.round(100 * state.divider));
-    for (const button of document.querySelectorAll("[name=drag]")) button.checked = button.value === state.drag;
     const dielectric = state.material === "dielectric";
     for (const name of ["index", "hasBase", "pigment"]) $(name).disabled = !dielectric;
     $("pigment").disabled = !(dielectric && state.hasBase);
@@ -142,8 +144,7 @@ class Controls {
         const span = (pointer) => Math.hypot(pointer.clientX - other.clientX, pointer.clientY - other.clientY);
         this.zoom(span(before) / Math.max(span(event), 1));
       } else {
-        const light = (this.state.drag === "light") !== (event.shiftKey || event.buttons === 2);
-        if (light) this.moveLight(0.4 * dx, 0.4 * dy);
+        if (event.shiftKey || event.buttons === 2) this.moveLight(0.4 * dx, 0.4 * dy);
         else this.orbit(0.4 * dx, 0.4 * dy);
       }
       pointers.set(event.pointerId, event);
@@ -167,10 +168,10 @@ class Controls {
     return this.pointers.size > 0;
   }
 
-  key(event) {
+  key(event, light = event.shiftKey) {
     const arrows = { ArrowLeft: [-3, 0], ArrowRight: [3, 0], ArrowUp: [0, -3], ArrowDown: [0, 3] };
     if (event.key in arrows) {
-      if (event.shiftKey) this.moveLight(...arrows[event.key]);
+      if (light) this.moveLight(...arrows[event.key]);
       else this.orbit(...arrows[event.key]);
     } else if (event.key === "+" || event.key === "=") this.zoom(0.9);
     else if (event.key === "-") this.zoom(1 / 0.9);

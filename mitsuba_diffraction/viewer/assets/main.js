@@ -3,25 +3,35 @@
 const MAX_FRAMES = 128;
 const EXPOSED_FRAMES = [1, 4, 16];  // after which the exposure is found, from less and less noise
 const BUDGET_MILLISECONDS = 80;  // of drawing between two turns of the page
+const LAMP_DISTANCE = 1.2;
 const BUSY_MILLISECONDS = 60;  // of a frame while dragging, above which fewer pixels are drawn
+
+const shapeOf = (data) => (data.shape === "coil" && !data.coil ? "sphere" : data.shape);
+
+// A skin on a snake; other surfaces on a plate or a sphere, in a sky that shows a metal as metal.
+function firstView(data) {
+  if (shapeOf(data) === "coil") {
+    return { azimuth: -60, elevation: 38, distance: 4.6, lightAzimuth: -20, lightElevation: 40,
+      lightWidth: 8, lightLength: 0, sky: 0.05, hasBase: data.material.material === "", pigment: "#20160c" };
+  }
+  const isDielectric = data.material.material === "";
+  const lines = data.spectrum.max_order.includes(0);
+  return { azimuth: -90, elevation: 20, distance: 5.2, lightAzimuth: -75, lightElevation: 35,
+    lightWidth: 6, lightLength: lines ? 60 : 0, sky: isDielectric ? 0.02 : 0.3, hasBase: isDielectric, pigment: "#141a22" };
+}
 
 function initialState(data) {
   const { material, spectrum } = data;
   return {
-    shape: material.from_radius ? "plate" : "sphere",
-    azimuth: -90, elevation: 20, distance: 5,
-    lightAzimuth: -50.7, lightElevation: 51.7, lightWidth: 3, lightLength: spectrum.max_order.includes(0) ? 30 : 0,
-    sky: 0.02, exposure: 0,
+    shape: shapeOf(data), ...firstView(data), exposure: 0,
     orientation: material.orientation,
     fromRadius: material.from_radius,
     heightScale: material.height_scale,
     coherenceLength: spectrum.coherence_length,
     material: material.material === "" ? "dielectric" : material.material,
     index: material.int_ior,
-    hasBase: false, pigment: "#40301c",
     right: "none", divider: 0.5, difference: false,
     quirks: allQuirks(true), terms: 37, brightness: PUBLISHED_BRIGHTNESS,
-    drag: "light",
     maxFrames: MAX_FRAMES,
   };
 }
@@ -41,6 +51,7 @@ function prepareControls(data) {
   if (!data.heights) for (const name of Object.keys(VARIANTS)) $("right").querySelector(`[value=${name}]`).remove();
   if (!data.picture) $("right").querySelector("[value=picture]").remove();
   $("source").textContent = data.source;
+  $("summary").textContent = data.summary;
   if (spectrum.warning) {
     $("warning").textContent = spectrum.warning;
     $("warning").hidden = false;
@@ -79,6 +90,12 @@ async function start() {
       dirty = true;
     },
     copy: () => copyCommand(data, state, tables.coil),
+    reset: () => controls.set({ shape: shapeOf(data), ...firstView(data), exposure: 0 }),
+    full: () => (document.fullscreenElement ? document.exitFullscreen() : $("stage").requestFullscreen()),
+    save: () => {
+      renderer.drawScreen(state, background());  // what is not drawn now is no longer there
+      canvas.toBlob((blob) => download(`${data.name}.png`, blob));
+    },
   });
 
   const background = () => {
@@ -178,15 +195,37 @@ async function start() {
       await shader2014.prepare(state, () => {});
       return Array.from(renderer.evaluateShader(shader2014, state, Float32Array.from(pairs)));
     },
-    command: () => commandOf(data, state, tables.coil),
+    command: () => commandOf(data, state),
+    scene: () => sceneOf(data, state, tables.coil),
   });
 }
 
 function show(renderer, state) {
   const of = (side) => (Number.isNaN(side.milliseconds) ? "…" : `${side.milliseconds.toPrecision(3)} ms`);
+  const drawing = Boolean(renderer.shader) && renderer.shader.frame === 0;
+  $("drawing").hidden = !drawing;
+  showLamp(state, renderer.width, renderer.height);
   const texts = [`This model: ${of(renderer.model)} a frame; ${renderer.model.frame} of ${state.maxFrames} frames.`];
   if (renderer.shader) texts.push(`Shader of 2014: ${of(renderer.shader)} a frame; ${renderer.shader.frame} averaged.`);
   $("times").textContent = texts.join(" ");
+}
+
+// The lamp where its direction is seen, just outside of the surface.
+function showLamp(state, width, height) {
+  const camera = cameraOf(state, width, height);
+  const place = scaled(lightOf(state), LAMP_DISTANCE);
+  const depth = state.distance - dot(place, camera.back);
+  const at = [camera.right, camera.up].map((axis, i) => dot(place, axis) / (depth * camera.tangents[i]));
+  const clipped = at.map((x) => Math.min(Math.max(x, -0.97), 0.97));
+  $("lamp").style.left = `${50 + 50 * clipped[0]}%`;
+  $("lamp").style.top = `${50 - 50 * clipped[1]}%`;
+  $("lamp").classList.toggle("behind", dot(place, camera.back) < 0);
+}
+
+function download(name, blob) {
+  const link = Object.assign(document.createElement("a"), { href: URL.createObjectURL(blob), download: name });
+  link.click();
+  setTimeout(() => URL.revokeObjectURL(link.href), 1000);
 }
 
 async function pictureOf(gl, picture) {

@@ -1,5 +1,7 @@
 // The spectrum of a pixel, and the orders that reach the eye there.
 
+const DARK = 1e-6;  // f cos theta, 1/sr, of what no eye sees
+
 class Picker {
   constructor(renderer, state) {
     Object.assign(this, { renderer, state });
@@ -68,12 +70,8 @@ class Picker {
 
   pick(x, y) {
     const found = this.directionsAt(x, y);
-    $("picked").hidden = false;
-    if (!found) {
-      $("picked-text").textContent = "Point at the surface.";
-      $("plot").replaceChildren();
-      return null;
-    }
+    $("picked").hidden = !found;
+    if (!found) return null;
     const values = this.spectrumOf(found);
     const orders = this.ordersOf(found);
     const rgb = toRGB(found.xyz);
@@ -84,6 +82,7 @@ class Picker {
     const digits = (v) => v.map((x) => x.toPrecision(3)).join(", ");
     $("picked-text").textContent = [
       `Light at ${angle(found.wi)}, eye at ${angle(found.wo)} from the normal.`,
+      Math.max(...values.map(([, value]) => value)) > DARK ? "" : "Nothing is diffracted from this light to the eye.",
       named.length ? `Orders, by the grating equation: ${named.join("; ")}.` : "",
       `XYZ ${digits(found.xyz)}; linear sRGB ${digits(rgb)}.`,
     ].join(" ");
@@ -92,7 +91,7 @@ class Picker {
   }
 
   plot(values, orders) {
-    const peak = Math.max(...values.map(([, value]) => value), 1e-12);
+    const peak = Math.max(...values.map(([, value]) => value), DARK);
     const x = (nm) => (((nm - 380) / 360) * 280).toFixed(1);
     const y = (value) => (92 - (86 * value) / peak).toFixed(1);
     const make = (name, attributes, text = "") => {
@@ -106,7 +105,7 @@ class Picker {
       .map(({ nanometres }) => make("line", { x1: x(nanometres), x2: x(nanometres), y1: 4, y2: 92, class: "mark" }));
     const axis = make("line", { x1: 0, x2: 280, y1: 92, y2: 92, class: "axis" });
     const labels = [400, 500, 600, 700].map((nm) => make("text", { x: x(nm), y: 106, "text-anchor": "middle" }, `${nm}`));
-    const top = make("text", { x: 2, y: 12 }, `${peak.toPrecision(3)} /sr`);
+    const top = make("text", { x: 2, y: 12 }, peak > DARK ? `${peak.toPrecision(3)} /sr` : "");
     $("plot").replaceChildren(axis, ...marks, line, ...labels, top);
   }
 }

@@ -173,7 +173,7 @@ class Renderer {
     gl.clearBufferfi(gl.DEPTH_STENCIL, 0, 1, 0);
     gl.enable(gl.DEPTH_TEST);
     gl.enable(gl.CULL_FACE);
-    this.mesh.use({ uProjection: projectionOf(camera, jitter, width, height) });
+    this.mesh.use({ uProjection: projectionOf(camera, jitter, width, height), uEye: camera.eye });
     this.coil.mesh.draw();
     gl.disable(gl.CULL_FACE);
     gl.disable(gl.DEPTH_TEST);
@@ -276,7 +276,7 @@ class Renderer {
 
   // The same for the model; where the light is not seen, its sky stays dim.
   exposureOf(state) {
-    return Math.min(this.autoExposure(), state.sky > 0 ? (0.15 * Math.PI) / state.sky : Infinity);
+    return Math.min(this.autoExposure(), state.sky > 0 ? (0.4 * Math.PI) / state.sky : Infinity);
   }
 
   // f cos theta_o of pairs, (n, 7): omega_i, omega_o along the pattern's axes, lambda in nm.
