@@ -81,6 +81,7 @@ def test_light_that_a_table_lacks_is_refused_with_its_range(llvm):
         assert "\n" not in str(found.value)
 
 
+@pytest.mark.slow
 def test_a_rigorous_spectrum_is_refused_outside_its_wavelengths(llvm):
     settings = {"theory": "rigorous", "int_ior": 1.5, "tolerance": 0.2, "coherence_length": 40.0}
     of = md.precompute(md.gratings.sinusoidal(1.0, 0.1), wavelengths=(500, 600), **settings)

@@ -64,7 +64,13 @@ def test_the_prediction_is_that_of_precompute(laser):
     assert np.abs(found - laser.predicted[0]).sum() < 0.03
 
 
-@pytest.mark.parametrize("request_", [{"wavelengths": 532}, {"wavelengths": 532, "int_ior": 1.5, "height_range": 1.6}])
+@pytest.mark.parametrize(
+    "request_",
+    [
+        {"wavelengths": 532},
+        pytest.param({"wavelengths": 532, "int_ior": 1.5, "height_range": 1.6}, marks=pytest.mark.slow),
+    ],
+)
 def test_the_bsdf_sends_light_where_the_design_says(request_, llvm):
     import mitsuba as mi
 

@@ -168,7 +168,8 @@ def test_the_documentation_names_the_scenes_that_request_denoising():
     scenes = Path(__file__).parents[2] / "scenes"
     requesting = {path.name for path in scenes.glob("*.xml") if is_requested(path)}
     assert requesting == {
-        f"{name}.xml" for name in ("glasses", "window", "rainbow", "compact_disc", "hologram", "anodised", "blaze")
+        f"{name}.xml"
+        for name in ("glasses", "window", "rainbow", "compact_disc", "hologram", "anodised", "blaze", "projection")
     }
 
 
