@@ -29,6 +29,7 @@ INSTRUMENTS = {
 }
 LANGUAGES = {
     "german.txt": ("Kanal:", "Breite:", "H\u00f6he:", "Werteinheiten:"),
+    "english_units.txt": ("Kanal:", "Breite:", "H\u00f6he:", "Value units:"),
     "french.txt": ("Canal\u00a0:", "Largeur :", "Hauteur :", "Unit\u00e9s de valeur :"),
     "english.txt": ("Channel:", "Width:", "Height:", "Value units:"),
     "chinese.asc": (

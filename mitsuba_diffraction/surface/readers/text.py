@@ -84,14 +84,15 @@ def read_table(path: Path, unit: str | tuple[str, str] | None) -> Scan:
 def _gwyddion_header(text: str) -> dict[str, str]:
     """Return what the comments of Gwyddion's export say, by the English names of `_GWYDDION`."""
     lines = [(match[1], match[2].strip()) for line in text.splitlines() if (match := _HEADER_LINE.match(line))]
-    if found := {name: value for name, value in lines if name in _GWYDDION and value}:
+    found = {name: value for name, value in lines if name in _GWYDDION and value}
+    if "Width" in found:
         return found
-    # In other languages their order tells: two lengths between a name and a unit.
+    # In other languages, some with "Value units" in English, their order tells: two lengths between a name and a unit.
     for four in zip(lines, lines[1:], lines[2:], lines[3:], strict=False):
         values = [value for _, value in four]
         if _has_unit(values[1]) and _has_unit(values[2]) and not _has_unit(values[0]):
             return {name: value for name, value in zip(_GWYDDION, values, strict=True) if value}
-    return {}
+    return found
 
 
 def is_gwyddion_export(start: bytes) -> bool:
