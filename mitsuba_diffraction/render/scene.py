@@ -95,8 +95,8 @@ def load_spectral_scene(
 
     The film becomes a `specfilm` of float32 whose channels are hat functions at `channel_wavelengths()` with areas of
     `channel_weights()`: divided by these, a channel is spectral radiance per nm, averaged over the hat. They cover
-    visible light, or the bands of a `specfilm` that reach beyond. Size, crop and reconstruction filter are those of the
-    scene. File names in the scene are relative to its folder.
+    visible light, or the bands of a `specfilm` that lie outside it. Size, crop and reconstruction filter are those of
+    the scene. File names in the scene are relative to its folder.
 
     Args:
         width: of the full film in pixels; the crop window is scaled with it. If only one of width and height is given,
