@@ -84,7 +84,7 @@ def _root(square: mi.Complex2f, is_real: bool) -> mi.Complex2f:
     """Return √z², of which real and imaginary part are not negative, and not both zero at the critical angle."""
     if is_real:
         # A literal zero, with which Dr.Jit simplifies all that follows.
-        return mi.Complex2f(dr.sqrt(larger(square.real, 1e-10)), 0)
+        return mi.Complex2f(dr.sqrt(larger(square.real, 1e-14)), 0)
     return dr.sqrt(mi.Complex2f(square.real, square.imag + 1e-10))
 
 
