@@ -174,7 +174,8 @@ def test_no_thickness_and_indices_of_either_medium_are_the_bare_surface(mode, va
         found = values(load(**parameters, thin_film_ior=film[0], thin_film_thickness=film[1]), wi, wo)
         np.testing.assert_allclose(found, expected, rtol=1e-5, atol=2e-6 * scale, err_msg=str(film))
     filmed = values(load(**parameters, thin_film_ior=2.35, thin_film_thickness=0.1), wi, wo)
-    assert np.abs(filmed - expected).max() > 0.1 * scale
+    shown = np.abs(expected) > 0.01 * scale
+    assert (np.abs(filmed - expected) > 0.2 * np.abs(expected))[shown].any()
 
 
 @pytest.mark.few(3)
