@@ -2,7 +2,8 @@
 
 With s = k_i,∥, light diffracted at the frequency q propagates if |λq + s| ≤ n_o: q lies in a disc of the radius n_o/λ
 around −s/λ. The rows of bins that meet this disc, and in each of them the columns that do, are intervals: differences
-of cumulative sums normalise a density that is restricted to them, for any medium and any incident direction.
+of cumulative sums normalise a density that is restricted to them, for any medium and any incident direction. Columns
+are summed in blocks of up to four, as large tables of sums are slow to read.
 """
 
 from __future__ import annotations
@@ -18,10 +19,11 @@ from scipy.special import ndtr
 from ..grating_spectrum import GratingSpectrum
 from ..spectrum.grids import OrderGrid, spline_integral
 from .geometry import Incidence
-from .inversion import KappaBins, choose, cumulative_sums, mean_powers, search
+from .inversion import KAPPA_BINS, KappaBins, choose, cumulative_sums, mean_powers, search
 from .tables import PacketTable, ProbabilityTable, larger, opaque
 
 MAX_BIN_SPACING = 0.06  # cycles/µm, to resolve the horizon
+MAX_BLOCK_WIDTH = 0.07  # cycles/µm, of blocks of more than one bin
 MAX_BIN_WIDTH = 2.0  # in σ_q
 LOBE_CUTOFF = 4.0  # of the lobes of orders, in σ_q
 
@@ -66,8 +68,8 @@ class BinSampler:
         p(q) = Σ_j w_j A_jrm/(M_j C_jr) / (Δ_x Δ_y)
 
     It is a mixture over κ (`KappaBins`). A_jrm is the mean power in the bin, M_j its sum over the rows of the disc, and
-    C_jr the fraction of row r in the columns of the disc. A bin is drawn by two binary searches, for its row and for
-    its column; the density at a given q reads one word and four packets.
+    C_jr the fraction of row r in the blocks of columns that meet the disc. A bin is drawn by two binary searches, for
+    its row and for its block; the density at a given q reads one word and four packets.
     """
 
     def __init__(self, spectrum: GratingSpectrum, typical_max_kappa: float | None = None) -> None:
@@ -75,12 +77,19 @@ class BinSampler:
         along_x, along_y = (BinAxis.of(spectrum, axis) for axis in (0, 1))
         probabilities = along_y.integrals @ mean_powers(spectrum, self.kappa_bins) @ along_x.integrals.T
         # Coefficients of splines may be negative.
-        self.probabilities = ProbabilityTable(np.moveaxis(np.maximum(probabilities, 0), 0, -1))
-        rounded = self.probabilities.values.astype(np.float64)
-        of_rows = rounded.sum(axis=1)
-        self.rows, self.columns = rounded.shape[:2]
+        probabilities = np.moveaxis(np.maximum(probabilities, 0), 0, -1)
+        shift = max(bits for bits in range(3) if bits == 0 or along_x.spacing * 2**bits <= MAX_BLOCK_WIDTH)
+        per_block = 2**shift
+        probabilities = np.pad(probabilities, ((0, 0), (0, -probabilities.shape[1] % per_block), (0, 0)))
+        in_blocks = probabilities.reshape(len(probabilities), -1, per_block, KAPPA_BINS)
+        self.probabilities = ProbabilityTable(np.pad(in_blocks, ((0, 0), (0, 0), (0, 4 - per_block), (0, 0))))
+        of_blocks = self.probabilities.values.astype(np.float64).sum(axis=2)
+        of_rows = of_blocks.sum(axis=1)
+        self.rows, self.blocks = of_blocks.shape[:2]
         self.cumulative_rows = PacketTable(cumulative_sums(of_rows))
-        self.cumulative_columns = PacketTable(cumulative_sums(rounded / np.maximum(of_rows[:, None], 1e-30)))
+        self.cumulative_blocks = PacketTable(cumulative_sums(of_blocks / np.maximum(of_rows[:, None], 1e-30)))
+        self.shift, self.last_in_block = mi.Int32(shift), mi.Int32(per_block - 1)
+        dr.make_opaque(self.shift, self.last_in_block)
         self.max_index_x, self.max_index_y = along_x.max_index, along_y.max_index
         self.spacing_x, self.spacing_y = opaque(along_x.spacing), opaque(along_y.spacing)
         self.per_q_x, self.per_q_y = opaque(1 / along_x.spacing), opaque(1 / along_y.spacing)
@@ -90,18 +99,19 @@ class BinSampler:
         m_x, m_y = mi.Int32(dr.round(q.x * self.per_q_x)), mi.Int32(dr.round(q.y * self.per_q_y))
         active = active & (dr.abs(m_x) <= self.max_index_x) & (dr.abs(m_y) <= self.max_index_y)
         row, column = m_y + self.max_index_y, m_x + self.max_index_x
-        fractions = self.probabilities(mi.UInt32(row * self.columns + column), active)
+        index = 4 * (row * self.blocks + (column >> self.shift)) + (column & self.last_in_block)
+        fractions = self.probabilities(mi.UInt32(index), active)
         first, end = self._rows_of_disc(incidence)
         mass = self.cumulative_rows(mi.UInt32(end), active) - self.cumulative_rows(mi.UInt32(first), active)
-        first, end = (mi.UInt32(row * (self.columns + 1) + i) for i in self._columns_of_disc(row, incidence))
-        mass *= self.cumulative_columns(end, active) - self.cumulative_columns(first, active)
+        first, end = (mi.UInt32(row * (self.blocks + 1) + i) for i in self._blocks_of_disc(row, incidence))
+        mass *= self.cumulative_blocks(end, active) - self.cumulative_blocks(first, active)
         weights = self.kappa_bins.weights(incidence) * dr.select(mass > 1e-20, dr.rcp(mass), 0)
         return dr.dot(weights, fractions) * self.per_q_x * self.per_q_y
 
     def sample(self, incidence: Incidence, u: mi.Float, v: mi.Point2f, active: mi.Bool) -> mi.Point2f:
         """Draw q in cycles/µm, for one wavelength.
 
-        `u` chooses the κ bin and the row, `v.x` the column and q_x in the bin, `v.y` q_y in the bin.
+        `u` chooses the κ bin and the row, `v.x` the block, the column and q_x in the bin, `v.y` q_y in the bin.
         """
         kappa_bin, u = choose(self.kappa_bins.weights(incidence), u)
 
@@ -110,9 +120,11 @@ class BinSampler:
 
         rows = self._rows_of_disc(incidence)
         row, _ = search(lambda i: cumulative(self.cumulative_rows, i), *rows, self.rows, u)
-        start, columns = row * (self.columns + 1), self._columns_of_disc(row, incidence)
-        column, x = search(lambda i: cumulative(self.cumulative_columns, start + i), *columns, self.columns, v.x)
-        m_x, m_y = mi.Float(column - self.max_index_x), mi.Float(row - self.max_index_y)
+        start, blocks = row * (self.blocks + 1), self._blocks_of_disc(row, incidence)
+        block, x = search(lambda i: cumulative(self.cumulative_blocks, start + i), *blocks, self.blocks, v.x)
+        column, x = choose(self.probabilities.block(mi.UInt32(row * self.blocks + block), kappa_bin, active), x)
+        m_x = mi.Float((block << self.shift) + mi.Int32(column) - self.max_index_x)
+        m_y = mi.Float(row - self.max_index_y)
         return mi.Point2f((m_x + x - 0.5) * self.spacing_x, (m_y + v.y - 0.5) * self.spacing_y)
 
     def _rows_of_disc(self, incidence: Incidence) -> tuple[mi.Int32, mi.Int32]:
@@ -120,12 +132,13 @@ class BinSampler:
         middle = -incidence.tangent.y * incidence.frequency
         return _interval(middle, incidence.radius, self.per_q_y, self.max_index_y)
 
-    def _columns_of_disc(self, row: mi.Int32, incidence: Incidence) -> tuple[mi.Int32, mi.Int32]:
-        """Return the first and the end of the columns that contain propagating q in a row."""
+    def _blocks_of_disc(self, row: mi.Int32, incidence: Incidence) -> tuple[mi.Int32, mi.Int32]:
+        """Return the first and the end of the blocks of columns that contain propagating q in a row."""
         middle_x, middle_y = -incidence.tangent * incidence.frequency
         distance = dr.abs(mi.Float(row - self.max_index_y) * self.spacing_y - middle_y) - 0.5 * self.spacing_y
         half = dr.safe_sqrt(dr.square(incidence.radius) - dr.square(larger(distance, 0)))
-        return _interval(middle_x, half, self.per_q_x, self.max_index_x)
+        first, end = _interval(middle_x, half, self.per_q_x, self.max_index_x)
+        return first >> self.shift, (end + self.last_in_block) >> self.shift
 
 
 def _interval(middle: mi.Float, half: mi.Float, per_q: mi.Float, max_index: int) -> tuple[mi.Int32, mi.Int32]:

@@ -154,7 +154,13 @@ class ProbabilityTable:
         self.values = np.ldexp(mantissas, exponents[..., None]).astype(np.float32)
         m = mantissas.astype(np.int64)
         words = (m[..., 0] << 26) | (m[..., 1] << 20) | (m[..., 2] << 14) | (m[..., 3] << 8) | (exponents + 127)
-        self.words = mi.UInt32(words.astype(np.uint32).ravel())
+        self.words = mi.UInt32(aligned(words.astype(np.uint32).ravel()))
+
+    def block(self, index: mi.UInt32, component: mi.UInt32, active: mi.Bool) -> mi.Vector4f:
+        """Return one component of the four packets from 4 · `index`; zero where not `active`."""
+        words = dr.gather(mi.Vector4u, self.words, index, active)
+        exponents = dr.reinterpret_array(mi.Vector4f, (words & 255) << 23)
+        return exponents * mi.Vector4f(mi.Vector4i((words >> (26 - 6 * component)) & 63))
 
     def __call__(self, index: mi.UInt32, active: mi.Bool) -> mi.Vector4f:
         """Return the packets at `index`; zero where not `active`."""
