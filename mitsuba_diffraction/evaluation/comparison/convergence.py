@@ -211,7 +211,7 @@ def save_plot(found: Convergence, path: str | os.PathLike[str]) -> None:
     figure.legend(handles, labels, loc="outside lower center", ncols=3, frameon=False, fontsize="small")
     width, height = found.size
     figure.suptitle(
-        f"{found.scene}, {width} × {height} pixels; × where the path tracer overtakes a shader", fontsize=10
+        f"{found.scene}\n{width} × {height} pixels; × where the path tracer overtakes a shader", fontsize=10
     )
     with whole_file(path) as temporary:
         figure.savefig(temporary, format="png", dpi=130, metadata=METADATA)
