@@ -10,7 +10,6 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from ..energy.table import EnergyTable
 from ..grating_spectrum import GratingSpectrum
 from ..precomputation import Spectrum
 from ..rigorous.spectrum import RigorousSpectrum
@@ -69,12 +68,12 @@ class SharedTables:
         """Return the sampler of orders for the media and scales of a scene; None where orders overlap."""
         if not self.scattering.resolved:
             return None
-        low, high = scales.ratios()
+        spectrum, (low, high) = cast(GratingSpectrum, self._spectrum), scales.ratios()
         ratios = np.linspace(low, high, 1 if low == high else SAMPLER_RATIOS)
         key = is_sheet, coat_index, ratios.tolist(), scales.min_lateral
         with self._lock:
             if self._orders is None or self._orders[0] != key:
-                self._orders = key, OrderSampler(cast(GratingSpectrum, self._spectrum), self._eta, *key)
+                self._orders = key, OrderSampler(cast(OrderSpectrum, self.scattering), spectrum, self._eta, *key)
             return self._orders[1]
 
     def energy(self, scales: Scales) -> Energy | None:
@@ -92,11 +91,7 @@ class SharedTables:
         key = np.linspace(low, high, count).tolist(), min(scales.min_lateral, 1.0)
         with self._lock:
             if self._energy is None or self._energy[0] != key:
-                if key == ([1.0], 1.0) and self._eta is None:
-                    table = spectrum.energy_table()
-                else:
-                    table = EnergyTable.of(spectrum, key[0], self._eta, key[1])
-                self._energy = key, Energy(table) if table.needed else None
+                self._energy = key, Energy.of(self.scattering, spectrum, self._eta, *key)
             return self._energy[1]
 
 

@@ -273,7 +273,7 @@ class Count:
 def test_changes_rebuild_only_what_depends_on_them(monkeypatch):
     bsdf = mi.load_dict(grating("deep blazed", int_ior=1.5, base={"type": "diffuse", "reflectance": uniform(0.3)}))
     parameters = mi.traverse(bsdf)
-    tables = Count(monkeypatch, shared.EnergyTable, "of")
+    tables = Count(monkeypatch, shared.Energy, "of")
     lines = Count(monkeypatch, shared, "OrderSpectrum")
     theory = bsdf.layers.grating.theory
     scattering, table = theory.scattering, theory.energy

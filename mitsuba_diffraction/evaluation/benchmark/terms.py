@@ -290,8 +290,7 @@ def _spectra(case: Case, series: Sequence[SeriesErrors]) -> dict[tuple[str, int 
         assert isinstance(whole.table, AmplitudeTable)
         for count in sorted({*SHOWN_TERMS, needed}):
             first = dataclasses.replace(whole.table, terms=whole.table.terms[:count])
-            # E is that of slices, as it takes time.
-            result[kind, count] = dataclasses.replace(whole, table=first, energy=slices.energy_table())
+            result[kind, count] = dataclasses.replace(whole, table=first)
     return result
 
 
