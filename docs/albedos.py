@@ -1,6 +1,6 @@
-"""Print the table of albedos in docs/plugin.md: of a perfect mirror with each built-in profile, and each recipe.
+"""Print albedos as in docs/plugin.md: of a perfect mirror with each built-in profile, and each recipe.
 
-    python docs/albedos.py                    # half an hour
+    python docs/albedos.py                    # all surfaces; the spectra of recipes are built first
     python docs/albedos.py film.toml crossed
 
 Directions are random, half of them at more than 70°, wavelengths uniform from 360 to 830 nm.
@@ -25,8 +25,8 @@ from mitsuba_diffraction.llvm import choose_variant
 from mitsuba_diffraction.surface.gratings import PROFILES
 
 RECIPES = sorted(Path(__file__).parents[1].joinpath("precompute").glob("*.toml"))
-DIRECTIONS, SAMPLES = 2048, 1 << 11
-LARGEST, MORE_SAMPLES = 32, 1 << 16  # albedos that are measured again, more than one of 100
+DIRECTIONS, SAMPLES = 512, 1 << 11
+LARGEST, MORE_SAMPLES = 12, 1 << 15  # albedos that are measured again, more than one of 100
 SHEETS = ("film", "transmission_300", "transmission_600")  # also measured as clear sheets, light from both sides
 SIZES = {"period": 2.5, "depth": 0.25}  # µm, of profiles without default ones
 

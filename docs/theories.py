@@ -11,8 +11,10 @@ import functools
 import time
 from dataclasses import dataclass
 
-import drjit as dr
-import mitsuba as mi
+import mitsuba_diffraction  # noqa: F401  before Dr.Jit
+
+import drjit as dr  # isort: skip
+import mitsuba as mi  # isort: skip
 import numpy as np
 
 from mitsuba_diffraction.evaluation.benchmark.speed import Rays, seconds

@@ -35,7 +35,7 @@ from .tables import NumberTable, integer_part, larger, limited, opaque, smaller
 MAX_LINE_NODES = 1.2e5  # of a line grating, about
 MAX_SIDE = 64  # nodes along a side of the square of directions
 SLICES, CONTINUUM_SLICES = 16, 8  # nodes of 1/λ: if orders are resolved, and else
-MAX_EVALUATIONS = 1e7  # of orders or of samples, for the nodes of a table with one ratio; twice that of a continuum
+MAX_EVALUATIONS = 1e7  # of orders or of samples, for the nodes of a table with one ratio
 
 
 @dataclass
@@ -195,7 +195,7 @@ class Energy:
 
 def _nodes(spectrum: PowerSpectrum, eta: float | None, resolved: bool, frequencies: tuple[float, float]) -> Nodes:
     """Choose the nodes, as many as `MAX_EVALUATIONS` allow."""
-    grid, evaluations = spectrum.grid, 2.0 * SAMPLES
+    grid, evaluations = spectrum.grid, float(SAMPLES)
     if resolved and isinstance(grid, OrderGrid):
         # The number of orders that propagate, nearly.
         size = 2 * np.array(grid.tile_size) * max(eta or 1, 1) * np.mean(frequencies)

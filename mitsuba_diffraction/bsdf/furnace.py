@@ -31,7 +31,7 @@ from .tables import floats, larger, opaque
 
 Real = NDArray[np.float64]
 
-SAMPLES = 512  # of q for one direction and wavelength
+SAMPLES = 2048  # of q for one direction and wavelength; e of reflected light at an interface needs as many
 MAX_E = 1.05
 """Maximum stored 1/a; e is one where the interpolated value exceeds one, so that its kink lies at a = 1."""
 
@@ -171,7 +171,7 @@ class Furnace:
             geometry, incidence, propagates = self._pair(k_i, change, wavelength, reflects)
             power, density = self.scattering.evaluate(geometry, incidence, propagates)
             value = power * self._fresnel(geometry, reflects) / (geometry.factor * density)
-            return index + 1, total + dr.select(propagates & (power > 0), value, 0)
+            return index + 1, total + dr.select(propagates & (density > 0), value, 0)
 
         return _summed(add, mi.Int32(SAMPLES), dr.width(wavelength)) / SAMPLES
 

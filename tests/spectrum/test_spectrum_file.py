@@ -237,6 +237,12 @@ def grid_entry(spectrum):
     return "tileSize" if spectrum.extent == "tile" else "spacing"
 
 
+def test_a_file_that_contains_e_is_read_without_it(saved):
+    spectrum, path = saved
+    rewrite(path, header={"energy": '{"layout": {"period": 0.18}, "values": "eJw="}'})
+    assert_the_same(GratingSpectrum.load(path), spectrum)
+
+
 def test_a_missing_entry_of_the_header_is_refused(saved):
     spectrum, path = saved
     content = path.read_bytes()
