@@ -27,7 +27,7 @@ SLOW = {"compare", "design", "long_renders", "own_grating", "own_scan", "plugin"
 """Pages whose code takes long."""
 BLOCK = re.compile(r"^(?P<indent> *)```(?P<language>\w+)\n(?P<body>.*?)^ *```$", re.DOTALL | re.MULTILINE)
 REDUCED = {
-    "design": {"--texels": "8", "--iterations": "1"},
+    "design": {"--texels": "8", "--starts": "1"},
     "render": {"--width": "16", "--spp": "1"},
     "precompute": {"--tolerance": "0.05"},
     "compare": {"--width": "16", "--spp": "1", "--no-shares": None},

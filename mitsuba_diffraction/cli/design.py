@@ -40,8 +40,8 @@ def design(
     ] = None,
     levels: Annotated[int | None, typer.Option(help="number of equidistant heights; default: continuous")] = None,
     tool_blur: Annotated[float, typer.Option(help="standard deviation of the tool's blur, µm")] = 0.13,
-    iterations: Annotated[int, typer.Option(help="of the last search")] = 400,
-    seed: Annotated[int, typer.Option(help="of the random reliefs from which the search starts")] = 0,
+    starts: Annotated[int, typer.Option(help="random reliefs, of which the best is continued; more take longer")] = 24,
+    seed: Annotated[int, typer.Option(help="of the random reliefs")] = 0,
     overwrite: Overwrite = False,
 ) -> None:
     """Compute the relief that casts a picture in white light, or in that of a laser."""
@@ -64,7 +64,7 @@ def design(
             int_ior,
             levels,
             tool_blur=tool_blur,
-            iterations=iterations,
+            starts=starts,
             seed=seed,
             progress=progress,
         )
@@ -112,16 +112,9 @@ def read_target(path: Path) -> NDArray[np.float64]:
 
 def _report(found: Design) -> None:
     columns = ["wavelength", "in the target", "correlation", "unevenness", "mirror direction", *found.changed]
+    measures = (found.wavelengths, found.efficiency, found.correlation, found.unevenness, found.mirror)
     rows = [
-        [f"{wavelength:.0f} nm", f"{one[0]:.1%}", f"{one[1]:.3f}", f"{one[2]:.2f}", *(f"{x:.1%}" for x in one[3:])]
-        for wavelength, *one in zip(
-            found.wavelengths,
-            found.efficiency,
-            found.correlation,
-            found.unevenness,
-            found.mirror,
-            *found.changed.values(),
-            strict=True,
-        )
+        [f"{wavelength:.0f} nm", f"{light:.1%}", f"{correlation:.3f}", f"{unevenness:.2f}", *(f"{x:.1%}" for x in rest)]
+        for wavelength, light, correlation, unevenness, *rest in zip(*measures, *found.changed.values(), strict=True)
     ]
     show(table(columns, rows), width=130)

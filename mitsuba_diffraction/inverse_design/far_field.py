@@ -3,9 +3,10 @@
     z = U h Uᵀ                                   heights of the pixels, from those of the texels, h (`blurred_texels`)
     η_m = |F_m|²,  F = fft2(e^{iκz})/N           power of each order, for light along the normal
     P = A_y η A_xᵀ                               power in each bin of direction cosines (`lobes_in_bins`)
-    L = Σ (P − t)²/Σ t²                          t the wanted fraction of the light, Σ over bins and wavelengths
+    L_λ = Σ (P − t)²/Σ t²                        t the wanted fraction of the light, Σ over bins (`relative_difference`)
+    L = (mean L_λ³)^⅓                            over the wavelengths: the larger ones count more (`cubic_mean`)
 
-    ∂L/∂P (`squared_difference`),   ∂L/∂z (`phase_gradient`) with g = A_yᵀ ∂L/∂P A_x,   ∂L/∂h = Uᵀ ∂L/∂z U
+    ∂L/∂P = ∂L/∂L_λ ∂L_λ/∂P,   ∂L/∂z (`phase_gradient`) with g = A_yᵀ ∂L/∂P A_x,   ∂L/∂h = Uᵀ ∂L/∂z U
 
 The constraints are `bounds` of the heights and `nearest_levels`.
 """
@@ -64,7 +65,8 @@ class FarField:
     Attributes:
         texels: U, (pixels, texels).
         kappa: κ of each wavelength, (w,) rad/µm.
-        lobes: A of each wavelength, (w, bins, pixels), orders as in `scipy.fft.fftfreq`, the same along x and y.
+        lobes: A of each wavelength, (w, bins, pixels), orders as in `scipy.fft.fftfreq`, the same along x and y. Its
+            precision is that of the FFTs.
         wanted: t, (w, bins, bins), rows ↔ +y; sums to one for each wavelength.
     """
 
@@ -79,28 +81,37 @@ class FarField:
 
     def loss(self, heights: Array) -> tuple[float, Array]:
         """Return L and ∂L/∂h, (texels, texels) 1/µm, at the heights h of the texels in µm."""
-        z, total = self.relief(heights), 0.0
-        gradient = np.zeros(z.shape)
-        for kappa, lobes, wanted in zip(self.kappa, self.lobes, self.wanted, strict=True):
-            wave = np.exp(1j * kappa * z)
-            amplitudes = scipy.fft.fft2(wave, norm="forward")
-            predicted = lobes @ (amplitudes.real**2 + amplitudes.imag**2) @ lobes.T
-            value, of_predicted = squared_difference(predicted, wanted)
-            total += value
-            gradient += phase_gradient(wave, amplitudes, kappa, lobes.T @ of_predicted @ lobes)
-        scale = (self.wanted**2).sum()
-        return total / scale, self.texels.T @ gradient @ self.texels / scale
+        dtype = self.lobes.dtype
+        kappa, transposed = self.kappa[:, None, None].astype(dtype), self.lobes.swapaxes(1, 2)
+        phase = kappa * self.relief(heights).astype(dtype)
+        wave = np.cos(phase) + 1j * np.sin(phase)
+        amplitudes = scipy.fft.fft2(wave, norm="forward")
+        predicted = self.lobes @ (amplitudes.real**2 + amplitudes.imag**2) @ transposed
+        differences, of_predicted = relative_difference(predicted, self.wanted)
+        value, of_differences = cubic_mean(differences)
+        g = transposed @ (of_differences[:, None, None] * of_predicted).astype(dtype) @ self.lobes
+        gradient = phase_gradient(wave, amplitudes, kappa, g).sum(axis=0)
+        return value, self.texels.T @ gradient @ self.texels
 
 
-def squared_difference(predicted: Array, wanted: Array) -> tuple[float, Array]:
-    """Return Σ (P − t)² and its gradient 2 (P − t) with respect to P."""
-    difference = predicted - wanted
-    return float((difference**2).sum()), 2 * difference
+def relative_difference(predicted: Array, wanted: Array) -> tuple[Array, Array]:
+    """Return L_λ, (w,), and ∂L_λ/∂P = 2 (P − t)/Σ t², (w, bins, bins)."""
+    difference, scale = predicted - wanted, (wanted**2).sum(axis=(1, 2))
+    return (difference**2).sum(axis=(1, 2)) / scale, 2 * difference / scale[:, None, None]
 
 
-def phase_gradient(wave: NDArray[np.complex128], amplitudes: NDArray[np.complex128], kappa: float, g: Array) -> Array:
+def cubic_mean(values: Array) -> tuple[float, Array]:
+    """Return L = (mean v³)^⅓ of values v > 0, (w,), and its gradient, (v/L)²/w."""
+    mean = float(np.cbrt((values**3).mean()))
+    return mean, (values / mean) ** 2 / len(values)
+
+
+def phase_gradient(
+    wave: NDArray[np.complexfloating], amplitudes: NDArray[np.complexfloating], kappa: Array, g: Array
+) -> Array:
     """Return ∂L/∂z = 2 Re[conj(iκ e^{iκz}) · ifft2(g F)] from e^{iκz}, F and g = ∂L/∂η, all of one shape."""
-    return 2 * kappa * (np.conj(1j * wave) * scipy.fft.ifft2(g * amplitudes)).real
+    back = scipy.fft.ifft2(g * amplitudes)
+    return 2 * kappa * (wave.real * back.imag - wave.imag * back.real)
 
 
 def nearest_levels(heights: Array, height_range: float, levels: int) -> Array:

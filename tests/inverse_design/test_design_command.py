@@ -12,7 +12,7 @@ from mitsuba_diffraction.cli.design import read_target
 from mitsuba_diffraction.outputs import check_outputs
 from mitsuba_diffraction.recipe import Recipe
 
-OPTIONS = "--texel 1 --texels 12 --wavelength 532 --iterations 10"
+OPTIONS = "--texel 1 --texels 12 --wavelength 532 --starts 1"
 
 
 @pytest.fixture(autouse=True)
@@ -32,7 +32,7 @@ def test_a_design_is_written_as_relief_recipe_and_picture(command):
     assert (code, error) == (0, "")
     assert "532 nm" in said
     assert {path.name for path in Path().glob("plate.*")} == {"plate.gsf", "plate.tif", "plate.toml", "plate.png"}
-    options = {"texel": 1.0, "texels": 12, "wavelengths": 532, "iterations": 10, "seed": 3}
+    options = {"texel": 1.0, "texels": 12, "wavelengths": 532, "starts": 1, "seed": 3}
     expected = md.design(read_target(Path("flag.png")), **options).height_field
     field = md.read_height_field("plate.gsf")
     assert field.pixel_size == pytest.approx(expected.pixel_size, rel=1e-6)
