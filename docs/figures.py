@@ -90,12 +90,6 @@ FIGURES = (
     ),
     Figure(("design.png",), "mitsuba-diffraction design precompute/designed/cat.png -o {out}/design.gsf"),
     Figure(
-        ("projection.png",),
-        """mitsuba-diffraction render scenes/projection.xml --width 480 --height 270 --spp 32 --exposure 10.3 \
-            --denoise -o {out}/projection.exr""",
-        2,
-    ),
-    Figure(
         ("efficiencies.png",),
         """mitsuba-diffraction efficiency ruled,lines_per_mm=1200 --theory rigorous --material Al --angle 17.5 \
             --wavelength 400:700:10 --plot {out}/efficiencies.png""",

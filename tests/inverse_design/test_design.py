@@ -147,7 +147,7 @@ def test_white_light_is_directed_at_all_wavelengths():
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("size", [0.36, 0.55, 0.75])
+@pytest.mark.parametrize("size", [0.4, 0.55, 0.75])
 def test_the_default_plate_casts_compact_pictures(size):
     """In white light 70 % of the light is inside, with a correlation of 0.9."""
     y, x = np.mgrid[1:-1:48j, -1:1:48j]
