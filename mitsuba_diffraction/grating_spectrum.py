@@ -1,23 +1,28 @@
-"""A power spectrum, and its file.
+"""A power spectrum with the table that bounds its albedo, and its file.
 
 The file is OpenEXR: float32, ZIP, one part, one pixel per diffraction order or node.
 
 Channels are named after what they hold: `S(012.2)` is the coefficient of t² on interval 12 of κ. Those of a series of
 the amplitude are `F{u^003}.re` and `.im` (taylor) or `F{T_003}.re` (chebyshev), F_n with u = h/`heightScale`. Rows are
-orders m_y, columns m_x, from −M to M. Numbers in the header are double precision. `contentSha256` covers every
-byte of the file and reveals damage.
+orders m_y, columns m_x, from −M to M. Numbers in the header are double precision. `energy` is JSON: the table of
+`energy/table.py`. `contentSha256` covers every byte of the file and reveals damage.
 """
 
 from __future__ import annotations
 
+import json
 import os
+import threading
 from dataclasses import dataclass, field, replace
+from functools import cached_property
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
+from .energy.table import EnergyTable
 from .errors import RequestError
+from .progress import stage
 from .settings import REPRESENTATIONS, Settings
 from .spectrum.exr import doubles, one_line, read, write
 from .spectrum.grids import OrderGrid, SplineGrid
@@ -36,16 +41,30 @@ _NUMBERS = {
 }
 _OTHERS = {"patches": "patches", "source": "source", "source_digest": "sourceSha256"}
 
+_energy_lock = threading.Lock()
+
 
 @dataclass(frozen=True, eq=False)
 class GratingSpectrum(PowerSpectrum):
-    """A power spectrum, and its file.
+    """A power spectrum, the factor E that bounds the albedo by one, and its file.
 
     Attributes:
+        energy: the table of E, if read from the file; otherwise `energy_table` computes it.
         warning: why scalar theory is inaccurate for the surface of a recipe, or "".
     """
 
+    energy: EnergyTable | None = field(default=None, repr=False)
     warning: str = field(default="", repr=False)
+
+    def energy_table(self) -> EnergyTable:
+        """Return the table of E, which bounds the albedo by one; computed at the first call unless read from a file."""
+        with _energy_lock:
+            return self._energy
+
+    @cached_property
+    def _energy(self) -> EnergyTable:
+        with stage("bound of the albedo"):
+            return EnergyTable.of(self) if self.energy is None else self.energy
 
     def up_to(self, longest: float) -> GratingSpectrum:
         """Return the spectrum for wavelengths up to `longest`, nm; the table, for κ from zero, holds for all of them.
@@ -55,7 +74,7 @@ class GratingSpectrum(PowerSpectrum):
         if longest <= self.wavelengths[1] * (1 + 1e-6):
             return self
         settings = replace(self.settings, wavelengths=(self.wavelengths[0], longest))
-        return replace(self, settings=settings)
+        return replace(self, settings=settings, energy=None)
 
     def save(self, path: str | os.PathLike[str], recipe: str = "") -> None:
         """Write the spectrum as an OpenEXR file, atomically; `recipe` is the digest of its `Recipe`.
@@ -82,6 +101,7 @@ class GratingSpectrum(PowerSpectrum):
             **({} if self.standard_error is None else {"standardError": doubles(self.standard_error)}),
             "units": "lengths in micrometres, wavelengths in nanometres",
             **({"warning": self.warning} if self.warning else {}),
+            "energy": json.dumps(self.energy_table().as_plain()),
         }
         if isinstance(table, AmplitudeTable):
             header |= {"heightScale": doubles(table.height), "heightsFrom": self.settings.heights_from}
@@ -134,6 +154,7 @@ class GratingSpectrum(PowerSpectrum):
                 pixel_size=_pair(header["pixelSize"]),
                 **entries,
                 standard_error=_single(header["standardError"]) if settings.extent == "sample" else None,
+                energy=EnergyTable.from_plain(json.loads(header["energy"])),
                 warning=header.get("warning", ""),
             )
         except KeyError as error:

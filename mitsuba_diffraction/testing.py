@@ -7,7 +7,7 @@ import mitsuba as mi
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from .bsdf.tables import floats
+from .bsdf.tables import aligned
 from .errors import RequestError
 from .llvm import is_supported
 
@@ -33,6 +33,16 @@ def towards(wi: Array, q: ArrayLike, wavelength: ArrayLike) -> Array:
 def vectors(omega: ArrayLike) -> mi.Vector3f:
     """Convert (n, 3) or (3,) to vectors of Mitsuba."""
     return _components(mi.Vector3f, omega)
+
+
+def floats(values: ArrayLike) -> mi.Float:
+    """Convert (n,) or a number to floats of Mitsuba.
+
+    The copy is neither a literal nor NumPy's own memory, so that the next call reuses the kernel.
+    """
+    result = mi.Float(aligned(np.atleast_1d(np.asarray(values, np.float32))))
+    dr.make_opaque(result)
+    return result
 
 
 def array(value: object, dtype: type | None = None) -> NDArray:

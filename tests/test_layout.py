@@ -24,6 +24,7 @@ LEVELS = {
     "base": "color errors files geometry llvm manual outputs progress settings",
     "surface": "surface",
     "spectrum": "spectrum",
+    "energy": "energy",
     "rigorous": "rigorous",
     "theory": "efficiency peaks reference scalar_theory",
     "precompute": "grating_spectrum precomputation inverse_design recipe",

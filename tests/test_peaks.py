@@ -7,8 +7,7 @@ import numpy as np
 import pytest
 
 import mitsuba_diffraction as md
-from mitsuba_diffraction.bsdf.furnace import Furnace
-from mitsuba_diffraction.bsdf.shared import SharedTables
+from mitsuba_diffraction.energy.furnace import Furnace
 
 PRECOMPUTE = Path(__file__).parents[1] / "precompute"
 LOBE = 1 - np.exp(-4)  # fraction of a lobe in a peak
@@ -44,13 +43,11 @@ def test_a_sinusoid_has_the_peaks_of_its_orders(sinusoid):
     assert np.tan(np.deg2rad(found.peaks[0].direction_uncertainty)) == pytest.approx(2 * sinusoid.lobe_width, rel=0.1)
 
 
-def test_the_sum_is_the_albedo(sinusoid, llvm):
+def test_the_sum_is_the_albedo(sinusoid):
     found = md.peak_efficiencies(sinusoid, 10, [450, 600], material="none", azimuth=30)
     theta, phi = np.deg2rad((10, 30))
     omega = -np.sin(theta) * np.cos(phi), -np.sin(theta) * np.sin(phi), np.cos(theta)
-    albedo = Furnace.of(SharedTables.of(sinusoid).scattering, sinusoid).albedo(
-        np.array([omega, omega]), np.array([0.45, 0.6])
-    )
+    albedo = Furnace.of(sinusoid).albedo(np.array([omega, omega]), np.array([0.45, 0.6]))
     np.testing.assert_allclose(found.unpolarised.sum(axis=0)[0], np.minimum(albedo[0], 1), atol=0.01)
 
 

@@ -6,6 +6,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from mitsuba_diffraction.energy.table import EnergyTable
 from mitsuba_diffraction.precomputation import load_spectrum
 from mitsuba_diffraction.recipe import READY_SPECTRA, Recipe
 from mitsuba_diffraction.render.scene import load_spectral_scene
@@ -22,7 +23,7 @@ import ready_spectra  # noqa: E402
 def test_a_spectrum_of_the_package_is_that_of_its_recipe(name, tmp_path):
     recipe = Recipe.load(ROOT / "precompute" / f"{name}.toml")
     kept = load_spectrum(READY_SPECTRA / f"{recipe.digest()}.exr", recipe=recipe.digest())
-    recipe.build().save(tmp_path / "built.exr")
+    recipe.build().save(tmp_path / "built.exr")  # with its table of E
     built = load_spectrum(tmp_path / "built.exr")
     assert (kept.source, kept.warning) == (built.source, built.warning)
     assert kept.error == pytest.approx(built.error, rel=1e-3)
@@ -30,6 +31,7 @@ def test_a_spectrum_of_the_package_is_that_of_its_recipe(name, tmp_path):
     for kappa in (8.0, 15.0, 22.0):
         found, expected = (spectrum.evaluate(q, kappa) for spectrum in (kept, built))
         assert np.abs(found - expected).sum() < 1e-4 * expected.sum()
+    assert np.abs(kept.energy.values.astype(int) - built.energy.values).max() <= 1
 
 
 def test_no_other_spectrum_is_in_the_package():
@@ -41,5 +43,6 @@ def test_no_other_spectrum_is_in_the_package():
 def test_first_pictures_compute_no_spectrum(scene, tmp_path, monkeypatch, llvm):
     monkeypatch.setenv("MITSUBA_DIFFRACTION_CACHE", str(tmp_path))
     monkeypatch.setattr(Recipe, "build", lambda *_: pytest.fail("a spectrum was computed"))
+    monkeypatch.setattr(EnergyTable, "of", lambda *_: pytest.fail("a table of E was computed"))
     load_spectral_scene(ROOT / "scenes" / f"{scene}.xml", width=4, height=4)
     assert not list(tmp_path.iterdir())

@@ -458,7 +458,7 @@ def rotated(omega: mi.Vector3f, sin: mi.Float, cos: mi.Float) -> mi.Vector3f:
 
 
 def on_square(omega: mi.Vector3f) -> tuple[mi.Float, mi.Float]:
-    """Return column and row of ω on the square of `nodes.py`, from 0 to 1, for ω above and below alike."""
+    """Return column and row of ω on the square of `energy/table.py`, from 0 to 1, for ω above and below alike."""
     t = dr.sqrt(limited(1 - dr.sqrt(larger(1 - dr.abs(omega.z), 0)), 0, 1))
     along = (1 - t) / larger(dr.abs(omega.x) + dr.abs(omega.y), 1e-12)
     return tuple(0.5 * (1 + along * of) for of in (omega.x + omega.y, omega.x - omega.y))

@@ -20,9 +20,9 @@ import mitsuba as mi
 import numpy as np
 from numpy.typing import NDArray
 
+from ..energy.table import Layout
 from ..grating_spectrum import GratingSpectrum
 from .geometry import Incidence, cell_of, on_square
-from .nodes import Nodes
 from .tables import BELOW_ONE, larger, limited, opaque
 
 KAPPA_BINS = 4  # the components of a packet
@@ -82,7 +82,7 @@ def choose(weights: mi.Vector4f, u: mi.Float) -> tuple[mi.UInt32, mi.Float]:
 
 
 def direction_bin(omega: mi.Vector3f, side: mi.Float | int) -> list[mi.UInt32]:
-    """Return the column and row of ω in bins on the square of `nodes.py`, `side` along each side."""
+    """Return the column and row of ω in bins on the square of `energy/table.py`, `side` along each side."""
     return [cell_of(side * coordinate, side)[0] for coordinate in on_square(omega)]
 
 
@@ -91,7 +91,7 @@ def direction_borders(side: int, steps: int) -> NDArray[np.float64]:
     along = np.linspace(0, 1, steps + 1)
     points = [point for t in along for point in ((0, 0, t), (0, 1, t), (0, t, 0), (0, t, 1))]
     corners = np.indices((1, side, side)).reshape(3, -1).T
-    omega, _ = Nodes(side, 2, (1.0, 2.0)).directions((corners[:, None] + points).reshape(-1, 3))
+    omega, _ = Layout(0.0, 1, side, 1, 2, (1.0, 2.0)).directions((corners[:, None] + points).reshape(-1, 3))
     return omega[:, :2].reshape(len(corners), -1, 2)
 
 

@@ -4,8 +4,8 @@ In each bin the probability of an order,
 
     P_m ∝ √⟨p_m²⟩,
 
-minimises the variance of a sample. p_m is the power of the order in `furnace.py`, and ⟨·⟩ the mean over points
-of the bin. Directions are mapped to the square of `nodes.py`.
+minimises the variance of a sample. p_m is the power of the order in `energy/furnace.py`, and ⟨·⟩ the mean over points
+of the bin. Directions are mapped to the square of `energy/table.py`.
 """
 
 from __future__ import annotations
@@ -20,14 +20,13 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.ndimage import map_coordinates
 
+from ..energy.furnace import Furnace
+from ..energy.table import Layout, bounds_of, frequencies_of
 from ..geometry import fresnel
 from ..grating_spectrum import GratingSpectrum
 from ..spectrum.grids import OrderGrid
-from .furnace import Furnace, bounds_of
 from .geometry import Incidence, cell_of
 from .inversion import direction_bin, direction_borders, search
-from .nodes import Nodes, frequencies_of
-from .scattering import Orders
 from .tables import NumberTable, PacketTable, integer_part, larger, opaque
 
 PROBABILITY_UNITS = 2**24  # to the probability one; float32 represents integers exactly up to it
@@ -58,7 +57,6 @@ class OrderSampler:
 
     def __init__(
         self,
-        scattering: Orders,
         spectrum: GratingSpectrum,
         eta: float | None = None,
         is_sheet: bool = False,
@@ -69,7 +67,6 @@ class OrderSampler:
         """Make the table.
 
         Args:
-            scattering: the tables of `spectrum`.
             spectrum: with the wavelengths in the densest medium next to the relief.
             eta: index below relative to that above; None without transmission.
             is_sheet: whether there is a flat lower face, with the upper medium below it.
@@ -92,12 +89,12 @@ class OrderSampler:
         entries = MAX_INTERFACE_ENTRIES if self.transmits and not is_sheet else MAX_ENTRIES
         side_bins = np.sqrt(entries / (np.sqrt(len(ranges)) * self.slices * orders.prod()))
         self.side_bins = int(np.clip(side_bins, MIN_SIDE_BINS, MAX_SIDE_BINS))
-        self.nodes = Nodes(self.side_bins, self.slices + 1, (first, last))
+        self.layout = Layout(0.0, 1, self.side_bins, 1, self.slices + 1, (first, last))
         borders = direction_borders(self.side_bins, 4)
         low, high = borders.min(1), borders.max(1)
         sums, bins, fractions, start = [], [], [], 0
         for scales, above in itertools.product(ranges, sides):
-            furnaces = [Furnace.of(scattering, spectrum, eta, scale) for scale in scales]
+            furnaces = [Furnace.of(spectrum, scale, eta, 1 if above else -1) for scale in scales]
             powers_of_sides = []
             for reflects in sides:
                 index = self._indices(above)[0] if reflects else abs(self.eta - 1)
@@ -116,8 +113,8 @@ class OrderSampler:
                 continue
             # With E at the central wavelength.
             omega, wavelengths = self._nodes(self.slices / 2)
-            albedo = furnaces[0].albedo(self._inside(omega, above), wavelengths)
-            reflected, transmitted = np.array(powers_of_sides) * bounds_of(albedo, eta)
+            albedo = furnaces[0].albedo(self._inside(omega, above), wavelengths / self._indices(above)[0])
+            reflected, transmitted = np.array(powers_of_sides) * bounds_of(albedo, furnaces[0].index)
             fraction = (transmitted / np.maximum(reflected + transmitted, 1e-30)).reshape(self.side_bins + 1, -1)
             middles = (np.indices((FRACTION_SIDE_BINS, FRACTION_SIDE_BINS)) + 0.5) * (
                 self.side_bins / FRACTION_SIDE_BINS
@@ -136,37 +133,39 @@ class OrderSampler:
         return (self.coat_index, 1.0) if above else (self.eta, 1.0 if self.is_sheet else self.eta)
 
     def _nodes(self, slice_: float) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-        """Return outside directions at the nodes of the square, and λ in µm above, next to the relief, at one 1/λ."""
+        """Return outside directions at the nodes of the square, and λ above in µm, at a coordinate along 1/λ."""
         nodes = np.indices((1, self.side_bins + 1, self.side_bins + 1)).reshape(3, -1).T.astype(np.float64)
         nodes[:, 0] = slice_
-        omega, wavelengths = self.nodes.directions(nodes)
-        return omega, wavelengths / self.coat_index
+        return self.layout.directions(nodes)
 
     def _inside(self, omega: NDArray[np.float64], above: bool) -> NDArray[np.float64]:
         """Return the directions next to the relief from those outside."""
         inside, outside = self._indices(above)
         tangent = omega[:, :2] * (outside / inside)
-        z = np.sqrt(np.maximum(1 - (tangent**2).sum(-1), 1e-12))
-        return np.column_stack([tangent, z if above else -z])
+        return np.column_stack([tangent, np.sqrt(np.maximum(1 - (tangent**2).sum(-1), 1e-12))])
 
     def _squared_powers(
         self, furnaces: Sequence[Furnace], above: bool, reflects: bool, slice_: float
     ) -> NDArray[np.floating]:
         """Return p_m² at the nodes of directions, averaged over scales of heights: (rows, columns, orders, orders)."""
-        outside, outgoing_below = self._indices(above)[1], above != reflects
+        (inside, outside), outgoing_below = self._indices(above), above != reflects
         omega, wavelengths = self._nodes(slice_)
-        orders = np.stack(np.meshgrid(*(np.arange(-last, last + 1) for last in self.max_order)), -1).reshape(-1, 2)
-        result = np.zeros((len(omega), len(orders)), np.float32)
+        result = np.zeros((len(omega), *(2 * self.max_order[::-1] + 1)), np.float32)
         for furnace in furnaces:
-            powers = furnace.order_powers(self._inside(omega, above), wavelengths, orders, reflects)
-            if self.is_sheet:
-                tangent = outside * omega[:, None, :2] + wavelengths[:, None, None] * orders / self.tile
-                square = 1 - (tangent**2).sum(-1)
-                powers = powers * (square > 0)
-                if outgoing_below:
-                    powers *= 1 - fresnel(np.sqrt(np.maximum(square, 0)), self.eta)
+            powers = np.zeros_like(result)
+            for way in furnace.branches[:1] if reflects else furnace.branches[1:]:
+                node, component, power = furnace.terms(self._inside(omega, above), wavelengths / inside, way)
+                m = np.rint((way or 1) * furnace.q[component] * self.tile).astype(np.int64)
+                if self.is_sheet:
+                    tangent = outside * omega[node, :2] + wavelengths[node, None] * m / self.tile
+                    square = 1 - (tangent**2).sum(-1)
+                    power = power * (square > 0)
+                    if outgoing_below:
+                        power *= 1 - fresnel(np.sqrt(np.maximum(square, 0)), self.eta)
+                column, row = (m + self.max_order).T
+                powers[node, row, column] += power
             result += powers**2 / len(furnaces)
-        return result.reshape(self.side_bins + 1, self.side_bins + 1, *(2 * self.max_order[::-1] + 1))
+        return result.reshape(self.side_bins + 1, self.side_bins + 1, *result.shape[1:])
 
     def _order_ranges(
         self, above: bool, reflects: bool, slice_: int, low: NDArray[np.float64], high: NDArray[np.float64]
@@ -175,7 +174,7 @@ class OrderSampler:
 
         They follow from the minima and maxima of ω_∥ outside in the bins, (bins, 2), by |m/T + k_i,∥/λ| ≤ n_o/λ.
         """
-        _, wavelengths = self.nodes.directions(np.array([[slice_, 0, 0], [slice_ + 1, 0, 0]], np.float64))
+        _, wavelengths = self.layout.directions(np.array([[slice_, 0, 0], [slice_ + 1, 0, 0]], np.float64))
         per_wavelength = self.tile / wavelengths[:, None]
         # With a margin for curved borders and for an index that changes by `MAX_INDEX_CHANGE`.
         half = self._indices(above == reflects)[1] * per_wavelength + 1e-3

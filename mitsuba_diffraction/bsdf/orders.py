@@ -362,7 +362,7 @@ class OrderSpectrum:
         q_sign, factor = incidence.q_sign, 1
         # Each window of orders is read at one κ: offsets of its column and row, lobes along x and y, κ.
         if self.q_sampler is None:
-            tangent = self.tangent(m_x, m_y, incidence.wavelength)
+            tangent = self._tangent(m_x, m_y, incidence.wavelength)
             factor = geometry.order_factor(tangent, incidence, per_width)
             windows = [(0, 0, lobes_x, lobes_y, geometry.order_kappa(tangent, incidence))]
             m = (mi.Int32(q_sign) * m_x, mi.Int32(q_sign) * m_y)
@@ -375,7 +375,7 @@ class OrderSpectrum:
             if self.is_line:
                 windows = []
                 for x, y in np.ndindex(len(lobes_x), len(lobes_y)):
-                    tangent = self.tangent(m_x + x, m_y + y, incidence.wavelength)
+                    tangent = self._tangent(m_x + x, m_y + y, incidence.wavelength)
                     lobe = geometry.order_factor(tangent, incidence, per_width) * lobes_x[x]
                     windows.append((x, y, [lobe], [lobes_y[y]], geometry.order_kappa(tangent, incidence)))
             else:
@@ -389,27 +389,7 @@ class OrderSpectrum:
         # Interpolated powers may be slightly negative.
         return dr.select(active, larger(power, 0), 0), density
 
-    def order_power(
-        self, m_x: mi.Int32, m_y: mi.Int32, geometry: Geometry, incidence: Incidence, active: mi.Bool
-    ) -> mi.Float:
-        """Return K G η_m of the order m that diffracts one of a pair of directions exactly into the other.
-
-        Near the horizon cosines are means over the lobe, cos⁴ θ → cos⁴ θ + (2 m_0² λσ_q)² with m_0 = 0.544.
-        """
-        width = incidence.wavelength / self.per_width
-        square_i, square_o = (
-            dr.sqrt(dr.square(k.square) + dr.square(0.592 * k.index * width))
-            for k in (geometry.incident, geometry.outgoing)
-        )
-        sign = mi.Int32(geometry.kappa_sign)
-        row, column = (
-            sign * m + (axis.max_order + axis.rim) for m, axis in zip((m_y, m_x), self.axes[::-1], strict=True)
-        )
-        at, whole = self.power.at(geometry.kappa(incidence.frequency), geometry.small()), [mi.Float(1.0)]
-        power = larger(self.power.window(row, column, whole, whole, at, active), 0)
-        return power * geometry.k_g(square_i, square_o, dr.squared_norm(geometry.tangent), incidence)
-
-    def tangent(self, m_x: mi.Int32, m_y: mi.Int32, wavelength: mi.Float) -> mi.Vector2f:
+    def _tangent(self, m_x: mi.Int32, m_y: mi.Int32, wavelength: mi.Float) -> mi.Vector2f:
         """Return λq of an order."""
         along_x, along_y = self.axes
         return mi.Vector2f(mi.Float(m_x) * along_x.pitch, mi.Float(m_y) * along_y.pitch) * wavelength
@@ -425,7 +405,7 @@ class OrderSpectrum:
         if self.q_sampler is not None:
             return self.q_sampler.sample(incidence, u, v, active), active
         m_x, m_y = self.order_sampler.sample(incidence, u, active)
-        tangent = self.tangent(m_x, m_y, incidence.wavelength)
+        tangent = self._tangent(m_x, m_y, incidence.wavelength)
         scale = incidence.lobe_scale
         q = mi.Point2f(self.axes[0].quantile(m_x, v.x, scale), self.axes[1].quantile(m_y, v.y, scale))
         return q, incidence.propagates(tangent)
@@ -453,12 +433,6 @@ class _Axis:
     def first(self, q: mi.Float) -> mi.Int32:
         """Return the first of the `count` orders that contribute at q (cycles/µm)."""
         return mi.Int32(-self.max_order) if self.reads_all else mi.Int32(dr.ceil(q * self.size - 0.5 * self.count))
-
-    def orders_between(self, low: mi.Float, high: mi.Float) -> tuple[mi.Int32, mi.Int32]:
-        """Return the first order between two q (cycles/µm) and the number of them, at least one."""
-        first, last = mi.Int32(dr.ceil(low * self.size)), mi.Int32(dr.floor(high * self.size))
-        first, last = (dr.clip(m, -self.max_order, self.max_order) for m in (first, last))
-        return first, dr.maximum(last - first + 1, 1)
 
     def contains(self, m: mi.Int32, q: mi.Float, scale: mi.Float | float) -> mi.Bool:
         """Return whether the order m exists and q lies in its lobe, scaled by `scale`."""

@@ -10,6 +10,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
+from ..energy.table import EnergyTable
 from ..grating_spectrum import GratingSpectrum
 from ..precomputation import Spectrum
 from ..rigorous.spectrum import RigorousSpectrum
@@ -68,12 +69,12 @@ class SharedTables:
         """Return the sampler of orders for the media and scales of a scene; None where orders overlap."""
         if not self.scattering.resolved:
             return None
-        spectrum, (low, high) = cast(GratingSpectrum, self._spectrum), scales.ratios()
+        low, high = scales.ratios()
         ratios = np.linspace(low, high, 1 if low == high else SAMPLER_RATIOS)
         key = is_sheet, coat_index, ratios.tolist(), scales.min_lateral
         with self._lock:
             if self._orders is None or self._orders[0] != key:
-                self._orders = key, OrderSampler(cast(OrderSpectrum, self.scattering), spectrum, self._eta, *key)
+                self._orders = key, OrderSampler(cast(GratingSpectrum, self._spectrum), self._eta, *key)
             return self._orders[1]
 
     def energy(self, scales: Scales) -> Energy | None:
@@ -91,7 +92,11 @@ class SharedTables:
         key = np.linspace(low, high, count).tolist(), min(scales.min_lateral, 1.0)
         with self._lock:
             if self._energy is None or self._energy[0] != key:
-                self._energy = key, Energy.of(self.scattering, spectrum, self._eta, *key)
+                if key == ([1.0], 1.0) and self._eta is None:
+                    table = spectrum.energy_table()
+                else:
+                    table = EnergyTable.of(spectrum, key[0], self._eta, key[1])
+                self._energy = key, Energy(table) if table.needed else None
             return self._energy[1]
 
 

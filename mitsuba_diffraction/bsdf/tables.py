@@ -11,7 +11,6 @@ from typing import Any
 import drjit as dr
 import mitsuba as mi
 import numpy as np
-from numpy.typing import ArrayLike
 
 from ..spectrum.tables import MIN_EXPONENT
 
@@ -37,16 +36,6 @@ def integer_part(x: mi.Float) -> mi.UInt32:
     Conversions between float32 and int32 are one instruction, those of uint32 take LLVM several without AVX-512.
     """
     return mi.UInt32(mi.Int32(x))
-
-
-def floats(values: ArrayLike) -> mi.Float:
-    """Convert (n,) or a number to floats of Mitsuba.
-
-    The copy is neither a literal nor NumPy's own memory, so that the next call reuses the kernel.
-    """
-    result = mi.Float(aligned(np.atleast_1d(np.asarray(values, np.float32))))
-    dr.make_opaque(result)
-    return result
 
 
 def opaque(value: float) -> mi.Float:

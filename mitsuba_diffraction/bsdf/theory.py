@@ -11,6 +11,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
+from ..energy.furnace import small_kappas
 from ..errors import RequestError
 from ..geometry import SHADOWING
 from ..grating_spectrum import GratingSpectrum
@@ -20,14 +21,12 @@ from ..settings import VISIBLE
 from .coat import SAME_INDEX
 from .energy import Coordinates, Energy
 from .fresnel import Material
-from .furnace import small_kappas
 from .geometry import Geometry, Incidence, Interface, rotated
 from .order_sampler import MAX_INDEX_CHANGE
 from .orders import OrderSpectrum
 from .parameters import GratingRequest, Media, check_parameters, check_transmission
 from .polarisation import Split, of_facets, of_orders
 from .rigorous_orders import RigorousOrders
-from .scattering import Scattering
 from .shared import SharedTables
 from .tables import opaque
 
@@ -38,6 +37,29 @@ _log = logging.getLogger(__name__)
 def _warn_of_range(source: str, warning: str) -> None:
     """Log a warning, once for each surface."""
     _log.warning("diffraction_grating, %s: %s", source, warning)
+
+
+class Scattering(Protocol):
+    """The powers of orders or of a continuum, and the density from which q is drawn.
+
+    Attributes:
+        resolved: whether orders do not overlap, so that most directions lie outside of all lobes.
+    """
+
+    resolved: bool
+
+    def meets(self, q_x: mi.Float, q_y: mi.Float, scale: mi.Float) -> mi.Bool:
+        """Return whether q (cycles/µm) lies in the lobe, scaled by `scale`, of an order; true where lobes overlap."""
+
+    def evaluate(self, geometry: Geometry, incidence: Incidence, active: mi.Bool) -> tuple[mi.Float, mi.Float]:
+        """Return the power and the density of q, both in µm², for one wavelength of a pair of directions.
+
+        The power is n_o² K G S |cos θ_o|, with the gain of lobes, or n_o² Σ_m η_m Γ N |cos θ_o| in rigorous theory.
+        Where orders are resolved, q lies in the lobe of one.
+        """
+
+    def sample(self, incidence: Incidence, u: mi.Float, v: mi.Point2f, active: mi.Bool) -> tuple[mi.Point2f, mi.Bool]:
+        """Draw q in cycles/µm for one wavelength; return it and whether its order propagates."""
 
 
 class Theory(Protocol):

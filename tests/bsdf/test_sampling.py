@@ -307,7 +307,7 @@ def test_bins_are_drawn_with_their_density_and_few_samples_are_evanescent(llvm, 
 @pytest.mark.parametrize(("theta", "phi"), [(0, 0), (40, 130), (85, 250)])
 def test_orders_are_drawn_with_their_probabilities(llvm, name, theta, phi):
     spectrum, count = md.precompute(SMALL[name]()), 1 << 20
-    sampler = OrderSampler(OrderSpectrum(spectrum), spectrum)
+    sampler = OrderSampler(spectrum)
     incidence = incidence_of(direction(theta, phi), 0.5)
     u, _ = points(numbers(count))
     drawn_x, drawn_y = sampler.sample(incidence, u, True)

@@ -14,7 +14,6 @@ import mitsuba_diffraction as md
 from mitsuba_diffraction import testing
 from mitsuba_diffraction.bsdf.geometry import Geometry, Incidence, Interface
 from mitsuba_diffraction.bsdf.order_sampler import OrderSampler
-from mitsuba_diffraction.bsdf.orders import OrderSpectrum
 
 PERIOD, ETA, WAVELENGTH = 3.35, 1.5, 0.5
 IMPORTANCE = mi.TransportMode.Importance
@@ -214,7 +213,7 @@ def test_samples_from_above_have_similar_weights(profile, kind, theta):
 @pytest.mark.parametrize("profile", ["film", "transmission_300"])
 def test_reflected_and_transmitted_orders_are_drawn_with_their_probabilities(profile, theta, is_sheet, above, reflects):
     spectrum = md.precompute(md.gratings.PROFILES[profile](), wavelengths=(240.0, 830.0), tolerance=0.01)
-    table = OrderSampler(OrderSpectrum(spectrum), spectrum, ETA, is_sheet)
+    table = OrderSampler(spectrum, ETA, is_sheet)
     kappas = mi.Float(1.0), mi.Float(1.0)
     interface = Interface(
         eta=mi.Float(ETA), is_sheet=is_sheet, kappas=kappas, transmitted_fraction=table.transmitted_fraction
@@ -298,7 +297,7 @@ def test_an_index_is_refused_for_which_the_spectrum_has_no_wavelengths():
 def test_other_parameters_leave_tables_of_varying_scales(monkeypatch):
     heights = {"type": "checkerboard", "color0": 0.95, "color1": 1.0}
     parameters = mi.traverse(transmitting("interface", period=1.0, depth=0.1, height_scale=heights))
-    monkeypatch.setattr("mitsuba_diffraction.bsdf.shared.Energy.of", None)
+    monkeypatch.setattr("mitsuba_diffraction.bsdf.shared.EnergyTable.of", None)
     monkeypatch.setattr("mitsuba_diffraction.bsdf.shared.OrderSampler", None)
     parameters["orientation.value"] = 30.0
     parameters.update()

@@ -2,6 +2,7 @@
 
 import functools
 import gc
+import json
 import weakref
 
 import drjit as dr
@@ -14,7 +15,8 @@ from scipy.ndimage import gaussian_filter
 import mitsuba_diffraction as md
 from mitsuba_diffraction import testing
 from mitsuba_diffraction.bsdf import shared
-from mitsuba_diffraction.bsdf.furnace import Furnace
+from mitsuba_diffraction.energy.furnace import Furnace
+from mitsuba_diffraction.energy.table import MAX_E, EnergyTable
 
 MAKE = {
     "flat": lambda: md.HeightField(np.zeros((1, 4)), 0.05),
@@ -36,11 +38,6 @@ pytestmark = pytest.mark.usefixtures("llvm")
 @functools.cache
 def spectrum(name, coherence_length=65.0):
     return md.precompute(MAKE[name](), coherence_length=coherence_length)
-
-
-def furnace(of, height_scale=1.0):
-    """The furnace of a spectrum, in reflection."""
-    return Furnace.of(shared.SharedTables.of(of).scattering, of, height_scale=height_scale)
 
 
 def random_surface(seed):
@@ -172,7 +169,7 @@ def energies(bsdf, omega, wavelength):
 @pytest.mark.parametrize("name", ["blazed", "crossed"])
 def test_e_is_one_where_the_albedo_is_less(name):
     of, (omega, _) = spectrum(name), random_directions(np.random.default_rng(6), 2000, 80)
-    a = furnace(of).albedo(omega, np.full(len(omega), 0.5))[0]
+    a = Furnace.of(of).albedo(omega, np.full(len(omega), 0.5))[0]
     e = energies(plugin(of), omega, 500)
     assert (e[a < 0.9] == 1).mean() > 0.98
     # The table agrees with the furnace on average.
@@ -200,26 +197,24 @@ def test_the_energy_factor_is_reciprocal(name):
     assert forward.min() < 0.95
 
 
-def test_e_of_lobes_wider_than_the_hemisphere_is_positive():
+def test_lobes_wider_than_the_hemisphere_have_a_table():
     heights = 0.05 * np.random.default_rng(0).random((32, 32))
-    omega, _ = random_directions(np.random.default_rng(1), 500)
     with pytest.warns(UserWarning, match="resolve frequencies up to"):
-        bsdf = plugin(md.precompute(md.HeightField(heights, 0.1), coherence_length=0.08))
-    assert bsdf.layers.grating.theory.energy is None or energies(bsdf, omega, 500).min() > 0
+        table = md.precompute(md.HeightField(heights, 0.1), coherence_length=0.08).energy_table()
+    assert table.values.min() > 0
 
 
 def test_a_period_far_below_the_wavelength_needs_no_energy_factor():
     relief = 0.1 * np.sin(np.linspace(0, 2 * np.pi, 64, endpoint=False))
-    omega, _ = random_directions(np.random.default_rng(1), 500)
-    bsdf = plugin(md.precompute(md.HeightField(relief[None], 1e-6)))
-    assert bsdf.layers.grating.theory.energy is None or energies(bsdf, omega, 500).min() > 0.99
+    table = md.precompute(md.HeightField(relief[None], 1e-6)).energy_table()
+    assert table.values.min() * MAX_E / 255 > 0.99
 
 
 def test_the_derivative_by_height_includes_that_of_the_energy_factor():
     of, (omega, _) = spectrum("deep blazed"), random_directions(np.random.default_rng(9), 300)
 
     def exact(scale):
-        return 1 / np.maximum(1, furnace(of, scale).albedo(omega, np.full(300, 0.5))[0])
+        return 1 / np.maximum(1, Furnace.of(of, scale).albedo(omega, np.full(300, 0.5))[0])
 
     wanted = (exact(0.601) - exact(0.599)) / 0.002
     bsdf, scale = plugin(of), mi.Float(0.6)
@@ -257,13 +252,31 @@ def test_a_grating_of_one_column_is_a_rotated_grating_of_one_row():
     np.testing.assert_allclose(energies(plugin(turned), omega[:, [1, 0, 2]], 500), along, atol=0.01)
 
 
-def test_e_does_not_depend_on_the_process(tmp_path):
-    of, (omega, _) = spectrum("deep blazed"), random_directions(np.random.default_rng(13), 500)
+def test_the_table_is_stored_with_the_spectrum(tmp_path, monkeypatch):
+    of = spectrum("deep blazed")
     of.save(tmp_path / "s.exr")
-    wanted = energies(plugin(of), omega, 500)
+    monkeypatch.setattr(EnergyTable, "of", lambda *_: pytest.fail("computed again"))
     loaded = md.GratingSpectrum.load(tmp_path / "s.exr")
     assert loaded.digest == of.digest
-    np.testing.assert_array_equal(energies(plugin(loaded), omega, 500), wanted)
+    found, wanted = loaded.energy_table(), of.energy_table()
+    np.testing.assert_array_equal(found.values, wanted.values)
+    assert (found.layout, found.ratios) == (wanted.layout, wanted.ratios)
+    assert wanted.values.nbytes < 4e5
+    bsdf = mi.load_dict({"type": "diffraction_grating", "filename": str(tmp_path / "s.exr")})
+    assert bsdf.layers.grating.theory.energy is not None
+
+
+@pytest.mark.parametrize(
+    "wrong",
+    [{"values": "AAAA"}, {"unknown": 1}, {"slices": 1 << 20}, {"frequencies": [1, 0]}, {"period": 0}],
+)
+def test_a_damaged_table_is_refused(wrong):
+    plain = json.loads(json.dumps(spectrum("blazed").energy_table().as_plain()))
+    EnergyTable.from_plain(plain)
+    damaged = plain["layout"] if wrong.keys() <= plain["layout"].keys() else plain
+    damaged.update(wrong)
+    with pytest.raises((ValueError, TypeError)):
+        EnergyTable.from_plain(plain)
 
 
 @pytest.mark.slow

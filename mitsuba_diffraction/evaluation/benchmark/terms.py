@@ -290,7 +290,8 @@ def _spectra(case: Case, series: Sequence[SeriesErrors]) -> dict[tuple[str, int 
         assert isinstance(whole.table, AmplitudeTable)
         for count in sorted({*SHOWN_TERMS, needed}):
             first = dataclasses.replace(whole.table, terms=whole.table.terms[:count])
-            result[kind, count] = dataclasses.replace(whole, table=first)
+            # E is that of slices, as it takes time.
+            result[kind, count] = dataclasses.replace(whole, table=first, energy=slices.energy_table())
     return result
 
 

@@ -1,0 +1,362 @@
+"""The albedo of a perfect mirror with the relief of a surface, in a white furnace.
+
+With R = 1 and E = 1 the BSDF reflects
+
+    a(ω_i, λ) = ∫ K G Γ S(q; κ) dq    over the q whose ω_o is above the surface (du dv = cos θ_o dω_o = λ² dq)
+
+with the gain Γ of lobes at the horizon. a is summed over components of S, each evaluated once:
+
+- An order that is evaluated by itself. With Γ it keeps its power wherever its centre propagates, so that it contributes
+  K G η_m(κ). Where the horizon truncates its lobe, cosines are replaced by their mean over the lobe,
+
+      cos θ → √(2λσ_q) m(x),    m(x) = ∫₀^∞ g(x) g(y) φ(x − y) √((x + y)/2) dy,    x = cos² θ/(2λσ_q)
+
+  with the `horizon_gain` g; m(x) → √x away from the horizon.
+- Where orders overlap, and for a sample, a bin of the frequency plane, in which S is accumulated. The part of its
+  radial extent that is above the horizon determines its weight and its cosine. Near the mirror direction at grazing
+  incidence (1 − b) K G + b Γ replaces K G, as in `Geometry.continuum_factor` of `bsdf/geometry.py`.
+
+For an interface between media, the reflected and the transmitted fraction of light from one side are
+
+    R(ω_i, λ) = ∫ F K G S(q; κ) Γ dq,    T(ω_i, λ) = ∫ (1 − F) K_t S(q; κ_t) Γ_t dq,    κ_t = 2π (cos θ_i − η cos θ_o)/λ
+
+with λ in the medium of ω_i, wave vectors in units of n_i (`geometry.transmitted`), and S(q; −κ) = S(−q; κ). Seen from
+below, the surface has the heights −h. A sheet uses the tables of an interface, as its flat face only removes light.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from functools import cache
+
+import numpy as np
+from numpy.polynomial.legendre import leggauss
+from numpy.typing import ArrayLike, NDArray
+from scipy.interpolate import CubicSpline
+
+from ..geometry import fresnel, horizon_gain, k_g, transmitted
+from ..spectrum.grids import OrderGrid
+from ..spectrum.power_spectrum import PowerSpectrum
+
+Real = NDArray[np.float64]
+Indices = NDArray[np.int64]
+
+KAPPA_STEP = 0.1  # radians of the phase of the deepest point between nodes in κ; powers are linear between nodes
+MAX_KAPPAS = 1000  # nodes in κ of an interface, eight of which lie below κ₁
+MAX_BIN_WIDTH = 0.12  # direction cosines at the shortest wavelength
+MIN_BINS = 2000
+INTERFACE_BIN_FACTOR = 1.5  # bins of an interface, which has three branches of light, are wider by this factor
+MAX_MIRROR_BIN_WIDTH = 0.5  # within the lobe of the mirror direction, in σ_q
+MAX_NODE_POINTS = 6  # on each side along x and y, for a node of S wider than half a bin
+MAX_LOBE_PHASE = 0.1  # radians within one σ of the lobe of an order, above which it is evaluated at several points
+LOBE_POINTS = 9
+MIN_COS_ONE_POINT = 0.25  # cos θ_o below which a bin is evaluated at three points
+MAX_PAIRS = 1 << 17  # (direction, component) evaluated at once, so that they fit into the cache
+
+
+@dataclass(frozen=True, eq=False)
+class Furnace:
+    """S(q; κ) as a sum of components.
+
+    Attributes:
+        spectrum: S(q; κ).
+        index: η = n_o/n_i, n_i being the index of the medium of ω; None if nothing is transmitted and F = 1.
+        by_order: whether components are orders, each evaluated by itself: for line gratings, and if no orders overlap.
+        q: (n, 2) cycles/µm, the centres of components.
+        widths: (n,) cycles/µm, their standard deviations.
+        powers: float32 (n, K), at K equidistant κ from 0 to κ_max of the spectrum, for unscaled heights.
+        height_scale: the factor of the heights.
+    """
+
+    spectrum: PowerSpectrum = field(repr=False)
+    index: float | None
+    by_order: bool
+    q: Real = field(repr=False)
+    widths: Real = field(repr=False)
+    powers: NDArray[np.float32] = field(repr=False)
+    height_scale: float = 1.0
+
+    @classmethod
+    def of(
+        cls, spectrum: PowerSpectrum, height_scale: float = 1.0, index: float | None = None, side: int = 1
+    ) -> Furnace:
+        """Return the components of `spectrum`.
+
+        Args:
+            spectrum: S(q; κ).
+            height_scale: the factor of the heights.
+            index: n below relative to n above, if light is transmitted.
+            side: 1 if ω is above the surface; −1 if below, where the surface has the heights −h and S(−q; κ).
+        """
+        grid, max_kappa = spectrum.grid, spectrum.max_kappa
+        by_order = isinstance(grid, OrderGrid) and (1 in grid.shape or all(lobe.count == 1 for lobe in spectrum.lobes))
+        count = max_kappa * spectrum.height_range / KAPPA_STEP
+        if index is not None:
+            # Below κ₁ powers are nearly parabolas in κ; K_t multiplies them by about 1/κ².
+            count = max(count, min(8 * max_kappa / min_kappa(spectrum, index), MAX_KAPPAS))
+        kappas = np.linspace(0, max_kappa, int(count) + 3, dtype=np.float64)
+        powers: NDArray[np.floating]
+        if by_order:
+            powers = np.stack([spectrum.powers(kappa).ravel() for kappa in kappas], 1)
+            # Truncated lobes are renormalised.
+            powers /= np.prod([lobe.inside for lobe in spectrum.lobes])
+            q, widths = _nodes(spectrum), np.full(len(powers), spectrum.lobe_width)
+        else:
+            q, widths, powers = _binned(spectrum, kappas, 1.0 if index is None else INTERFACE_BIN_FACTOR)
+        kept = powers.max(-1) > 1e-7
+        powers = np.ascontiguousarray(np.maximum(powers[kept], 0), np.float32)
+        relative_index = None if index is None else float(index) ** side
+        return cls(spectrum, relative_index, by_order, side * q[kept], widths[kept], powers, height_scale)
+
+    @property
+    def branches(self) -> tuple[int, ...]:
+        """0 for reflected light; for an interface also ±1, for transmitted light with that sign of v_z."""
+        return (0,) if self.index is None else (0, 1, -1)
+
+    def albedo(self, directions: Real, wavelengths: Real) -> Real:
+        """Compute a(ω, λ), or R and T of an interface.
+
+        Args:
+            directions: ω, (n, 3) unit vectors along the axes of the pattern, with z > 0 away from the surface.
+            wavelengths: λ in µm in the medium of ω, (n,).
+
+        Returns:
+            (1, n), or (2, n): R and T.
+        """
+        result = np.zeros((len(self.branches[:2]), len(directions)))
+        # Adjacent directions share most of their components.
+        for batch in np.array_split(np.arange(len(directions)), 1 + len(directions) * len(self.q) // MAX_PAIRS):
+            for branch in self.branches:
+                direction, _, value = self.terms(directions[batch], wavelengths[batch], branch)
+                result[abs(branch), batch] += np.bincount(direction, value, len(batch))
+        return result
+
+    def terms(self, directions: Real, length: Real, branch: int) -> tuple[Indices, Indices, Real]:
+        """Compute the terms of `albedo` for one branch of light: index of direction, of component, and value.
+
+        Component j diffracts light from ω to k_o,∥ = −ω_∥ − λ q_j, or −ω_∥ + λ q_j in branch −1, in units of n_i.
+        """
+        s, cos_i, index = directions[:, :2], np.abs(directions[:, 2]), (branch and self.index) or 1.0
+        q, radius = self.q * (branch or 1), np.zeros(len(self.q)) if self.by_order else np.sqrt(3) * self.widths
+        middle, mean = s.mean(0), (length.min() + length.max()) / 2
+        cutoff = index + np.hypot(*(s - middle).T).max() + (length.max() - mean) * np.hypot(*q.T)
+        near = np.flatnonzero(np.hypot(*(middle + mean * q).T) < cutoff + length.max() * radius)
+        # cos² θ_o = 1 − |ω_∥ + λq|²/η²
+        square = np.repeat(1 - (1 - cos_i[:, None] ** 2) / index**2, len(near), axis=1)
+        for k in np.flatnonzero(q.any(0)):
+            u = np.multiply.outer(length, q[near, k])
+            square -= u * (u + 2 * s[:, k, None]) / index**2
+        min_square = 0.0
+        if not self.by_order:
+            radii = np.multiply.outer(length / index, radius[near])
+            min_square = -radii * (2 + radii)
+        i, j = np.nonzero(square > min_square)
+        square, j = square[i, j], near[j]
+        if not self.by_order:
+            return self._bin_terms(i, j, np.sqrt(1 - square), cos_i, length, branch)
+        sigma = length[i] * self.spectrum.lobe_width
+        cos_exit = cos_o = mean_cosine(square, sigma / index)
+        weight: Real | float = 1.0
+        if 2 * np.pi * self.spectrum.height_range * self.height_scale * self.spectrum.lobe_width > MAX_LOBE_PHASE:
+            cos_exit, cos_o, weight = _over_lobe(square, sigma / index)
+            i, j, sigma = np.tile(i, LOBE_POINTS), np.tile(j, LOBE_POINTS), np.tile(sigma, LOBE_POINTS)
+        cos_i, length = cos_i[i], length[i]
+        mean_cos_i = mean_cosine(cos_i**2, sigma)
+        value = weight * self._factor(mean_cos_i, cos_o, length, length**2 * (q**2).sum(-1)[j], branch)
+        # κ of reflected light is that of the pair of directions, κ of transmitted light that of the order.
+        kappa = self._kappa(mean_cos_i if branch else cos_i, cos_o if branch else cos_exit, length, branch)
+        return i, j, value * self._power(j, kappa, branch)
+
+    def _bin_terms(
+        self, i: Indices, j: Indices, rho: Real, cos_i: Real, length: Real, branch: int
+    ) -> tuple[Indices, Indices, Real]:
+        """Compute the terms of directions i and bins j, whose centres have sin θ_o = ρ.
+
+        Near the horizon a bin has three terms, at points in cos θ_o, as K G varies with that, over the radial extent
+        ρ ± √3 σ.
+        """
+        index = (branch and self.index) or 1.0
+        sigma = length[i] * self.widths[j] / index
+        near_horizon, parts = (rho + np.sqrt(3) * sigma) ** 2 > 1 - MIN_COS_ONE_POINT**2, []
+        for count, chosen in ((1, np.flatnonzero(~near_horizon)), (3, np.flatnonzero(near_horizon))):
+            i_, j_ = np.tile(i[chosen], count), np.tile(j[chosen], count)
+            cos_o, r, weight = _above_horizon(rho[chosen], sigma[chosen], count)
+            length_, cos_ = length[i_], cos_i[i_]
+            # |λq|² along the line from the centre of the hemisphere
+            tangent, square = length_**2 * (self.q**2).sum(-1)[j_], 1 - cos_**2
+            rho_ = np.tile(rho[chosen], count)
+            tangent = square + index**2 * r**2 - r / np.maximum(rho_, 1e-12) * (index**2 * rho_**2 + square - tangent)
+            tangent = np.maximum(tangent, 0) + (index * np.tile(sigma[chosen], count)) ** 2
+            value = weight * self._factor(cos_, cos_o, length_, tangent, branch)
+            parts.append((i_, j_, value * self._power(j_, self._kappa(cos_, cos_o, length_, branch), branch)))
+        i, j, value = (np.concatenate(part) for part in zip(*parts, strict=True))
+        return i, j, value
+
+    def _factor(self, cos_i: Real, cos_o: Real, length: Real, tangent: Real, branch: int) -> NDArray[np.floating]:
+        """Return K G F with the gain, or K_t G_t (1 − F), at |λq|² = `tangent`; F = 1 without a medium below."""
+        if branch:
+            min_v_z = self._min_kappa / max(self.height_scale, 1e-9) * length / (2 * np.pi)
+            return transmitted(cos_i, cos_o, tangent, self.index or 1.0, min_v_z)
+        square = tangent + (cos_i + cos_o) ** 2
+        value = k_g(cos_i, cos_o, tangent)
+        if not self.by_order:
+            width = length * self.spectrum.lobe_width
+            b = np.clip((25 - tangent / width**2) / 9, 0, 1) * np.clip(2 - 5 * np.maximum(cos_i, cos_o), 0, 1)
+            mirror = np.flatnonzero(b)
+            gain = [horizon_gain(cos[mirror] ** 2 / (2 * width[mirror])) for cos in (cos_i, cos_o)]
+            value[mirror] += b[mirror] * (gain[0] * gain[1] - value[mirror])
+        return value if self.index is None else value * fresnel(np.sqrt(square) / 2, self.index)
+
+    def _kappa(self, cos_i: Real, cos_o: Real, length: Real, branch: int) -> Real:
+        """Return κ in rad/µm of two directions; zero if v_z of transmitted light lacks the sign of the branch."""
+        v_z = branch * (cos_i - (self.index or 1.0) * cos_o) if branch else cos_i + cos_o
+        return 2 * np.pi / length * np.maximum(v_z, 0)
+
+    @property
+    def _min_kappa(self) -> float:
+        return min_kappa(self.spectrum, self.index or 1.0, self.height_scale)
+
+    def _power(self, component: Indices, kappa: Real, branch: int) -> Real:
+        """Return the powers of components at κ; for transmitted light below κ₁ as `small_kappa`."""
+        last = self.powers.shape[1] - 1
+        flat, start = self.powers.ravel(), component * (last + 1)
+
+        def at(kappa: Real | float) -> Real:
+            x = np.minimum(kappa * (last / self.spectrum.max_kappa), last * (1 - 1e-12))
+            interval = np.asarray(x, np.int64)
+            below = flat[start + interval]
+            return below + (x - interval) * (flat[start + interval + 1] - below)
+
+        is_forward, kappa = kappa > 0, kappa * self.height_scale
+        if not branch:
+            return at(kappa)
+        first = self._min_kappa
+        return small_kappa(kappa, first, at(kappa), at(first), at(2 * first)) * is_forward
+
+
+def min_kappa(spectrum: PowerSpectrum, index: float, height_scale: float = 1.0) -> float:
+    """Return κ₁ in rad/µm, below which c_m/κ² of transmitted light is extrapolated linearly."""
+    first, undiffracted = small_kappas(spectrum, index)
+    return min(first, undiffracted * height_scale)
+
+
+def small_kappas(spectrum: PowerSpectrum, index: float) -> tuple[float, float]:
+    """Return the two bounds whose minimum is κ₁, in rad/µm.
+
+    The first is a quarter of the first interval of the table, where its error is as small as that of the linear
+    extrapolation. The second, to be multiplied by the scale of the heights, is 0.8 of the minimum κ of undiffracted
+    light at normal incidence. Wavelengths of the spectrum are those in the denser medium.
+    """
+    max_wavelength = spectrum.wavelengths[1] * 1e-3 * max(index, 1)
+    return spectrum.table.first_interval / 4, 1.6 * np.pi * abs(index - 1) / max_wavelength
+
+
+def small_kappa(kappa: Real, first: float, power: NDArray, at_first: NDArray, at_second: NDArray) -> Real:
+    """Return c_m(κ) = `power` above κ₁ = `first`; below, κ₁²/κ² c_m(κ), with c_m/κ² linear through κ₁ and 2κ₁."""
+    x = kappa / max(first, 1e-30)
+    return np.where(kappa < first, (2 - x) * at_first + 0.25 * (x - 1) * at_second, power)
+
+
+def mean_cosine(square: ArrayLike, sigma: ArrayLike) -> Real:
+    """Return √(2σ) m(x) for cos² θ = 2σx at the centre of a lobe of width σ in direction cosines."""
+    scale = np.sqrt(2 * np.asarray(sigma, np.float64))
+    root = np.asarray(np.sqrt(square) / scale)
+    near = root < 4
+    root[near] = np.interp(root[near], *_mean_roots())
+    return scale * root
+
+
+@cache
+def _mean_roots() -> tuple[Real, Real]:
+    """Return √x from 0 to 4 and m(x)."""
+    root, y = np.linspace(0, 4, 101, dtype=np.float64), np.linspace(0, 24, 4801, dtype=np.float64)
+    x = root[:, None] ** 2
+    density = horizon_gain(x) * horizon_gain(y) * np.exp(-((x - y) ** 2) / 2) / np.sqrt(2 * np.pi)
+    return root, np.trapezoid(density * np.sqrt((x + y) / 2), y, axis=1)
+
+
+def _over_lobe(square: Real, sigma: Real) -> tuple[Real, Real, Real]:
+    """Return points in a lobe of width σ about cos² θ_o: cos θ_o, the cosine in K G, and weight, (LOBE_POINTS · n,)."""
+    x, spread = square / (2 * sigma), np.sqrt(np.maximum(1 - square, 1e-6))
+    low, high = np.sqrt(np.maximum(x - 3 * spread, 0)), np.sqrt(x + 3 * spread)
+    nodes, weights = leggauss(LOBE_POINTS)
+    root = low + (high - low) * ((1 + nodes) / 2)[:, None]
+    weight = weights[:, None] * root * np.exp(-(((root**2 - x) / spread) ** 2) / 2) * horizon_gain(root**2)
+    scale = np.sqrt(2 * sigma)
+    return (scale * root).ravel(), (scale * np.sqrt((x + root**2) / 2)).ravel(), (weight / weight.sum(0)).ravel()
+
+
+def _above_horizon(rho: Real, sigma: Real, count: int) -> tuple[Real, Real, Real]:
+    """Return cos θ_o, r and weight, (count · n,), of points in a bin of width σ whose centre is at r = ρ.
+
+    r² + σ² + cos² θ_o = 1, where σ² is the variance across the radius; weights sum to the fraction of ρ ± √3 σ above
+    the horizon.
+    """
+    low, high = np.maximum(rho - np.sqrt(3) * sigma, 0), rho + np.sqrt(3) * sigma
+    nearest, farthest = (np.sqrt(np.maximum(1 - x**2 - sigma**2, 0)) for x in (low, high))
+    nodes, weights = leggauss(count)
+    cos_o = np.maximum(farthest + (nearest - farthest) * ((1 + nodes) / 2)[:, None], 1e-6)
+    r = np.sqrt(np.maximum(1 - cos_o**2 - sigma**2, 0))
+    # dr = cos θ dcos θ/r
+    weight = weights[:, None] * cos_o / np.maximum(r, 1e-9)
+    above = np.clip((np.sqrt(np.maximum(1 - sigma**2, 0)) - low) / (high - low), 0, 1)
+    return cos_o.ravel(), r.ravel(), (weight * above / weight.sum(0)).ravel()
+
+
+def _nodes(spectrum: PowerSpectrum) -> Real:
+    """Return q of all nodes of S, (rows · columns, 2) cycles/µm."""
+    return np.stack(np.meshgrid(*spectrum.grid.frequencies()), -1).reshape(-1, 2)
+
+
+def _binned(spectrum: PowerSpectrum, kappas: Real, width_factor: float) -> tuple[Real, Real, Real]:
+    """Accumulate the nodes of overlapping orders or of a sample in the bins of a lattice, finer near q = 0.
+
+    Args:
+        spectrum: S(q; κ).
+        kappas: rad/µm, equidistant.
+        width_factor: the factor of the width of a bin.
+
+    Returns:
+        Centres of power (n, 2), standard deviations (n,), both in cycles/µm, and powers (n, K).
+    """
+    sigma, grid, q = spectrum.lobe_width, spectrum.grid, _nodes(spectrum)
+    # The standard deviation of one node.
+    own = sigma if isinstance(grid, OrderGrid) else max(grid.spacing) / 2
+    shortest = 4 * np.pi / spectrum.max_kappa
+    width = width_factor * min(
+        MAX_BIN_WIDTH / shortest, np.sqrt(np.prod(np.minimum(np.ptp(q, axis=0), 4 / shortest)) / MIN_BINS)
+    )
+    # Bins are finer where b is not zero.
+    near = np.hypot(*q.T) < 6 * sigma
+    parts: list[tuple[NDArray, ...]] = []
+    for chosen, size in ((near, min(width, MAX_MIRROR_BIN_WIDTH * sigma)), (~near, width)):
+        # A node wider than half a bin is replaced by points of a Gaussian.
+        count = 0 if size > 2 * own else int(min(np.ceil(3 * own / size), MAX_NODE_POINTS))
+        offsets = np.linspace(-3, 3, 2 * count + 1) if count else np.zeros(1)
+        density = np.exp(-(offsets**2) / 2) / np.exp(-(offsets**2) / 2).sum()
+        around = own * np.stack(np.meshgrid(offsets, offsets), -1).reshape(-1, 2)
+        points = (q[chosen][:, None] + around).reshape(-1, 2)
+        node, weight = (
+            np.repeat(np.flatnonzero(chosen), len(around)),
+            np.tile(np.outer(density, density).ravel(), chosen.sum()),
+        )
+        spread = np.full(len(points), own / (2 * count + 1))
+        parts.append((points, np.column_stack([np.rint(points / size), spread]), node, weight, spread))
+    q, bins, node, weight, spread = (np.concatenate(part) for part in zip(*parts, strict=True))
+    if not isinstance(grid, OrderGrid):
+        # S is zero outside the Nyquist limit.
+        weight *= (np.abs(q) <= grid.limit).all(-1)
+    _, bins = np.unique(bins, axis=0, return_inverse=True)
+    bins = bins.ravel()
+    # Powers are band-limited in κ by the height range: cubic splines interpolate from fewer κ.
+    knots = np.linspace(0, kappas[-1], len(kappas) // 4 + 6)
+    powers, total = np.empty((bins.max() + 1, len(knots))), np.zeros(len(q))
+    for index, kappa in enumerate(knots):
+        power = np.maximum(spectrum.powers(kappa).ravel().astype(np.float64), 0)[node] * weight
+        powers[:, index] = np.bincount(bins, power)
+        total += power
+    total += 1e-12
+    moments = [np.bincount(bins, total * moment) for moment in (1, *q.T, *(q**2).T, spread**2)]
+    centre, square = np.stack(moments[1:3], -1) / moments[0][:, None], np.stack(moments[3:5], -1) / moments[0][:, None]
+    widths = np.sqrt(np.maximum(square - centre**2, 0).mean(-1) + moments[5] / moments[0])
+    return centre, widths, CubicSpline(knots, powers, axis=1)(kappas)

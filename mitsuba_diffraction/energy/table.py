@@ -1,0 +1,328 @@
+"""The factor e(ω, λ) that bounds the albedo by one, as a table.
+
+With R = 1 the BSDF without E has an albedo a(ω_i, λ) (`furnace.py`) that exceeds one for some directions. The BSDF is
+multiplied by
+
+    E = min(e(ω_i, λ), e(ω_o, λ)),    e = 1/max(1, a)
+
+which is reciprocal, and one where a ≤ 1 for both directions. The table holds e at nodes and is linear between them.
+Where e is smaller at the centre of a grid cell than the mean of its corners, these are lowered by the difference: a
+varies fast where an order is just above the horizon, and in deep reliefs. E is a safeguard of the model; docs/plugin.md
+has measured albedos.
+
+For a line grating of period T, with c = √(1 − ω_y²) and
+
+    u = (c − ω_x) T/λ,    v = (c + ω_x) T/λ
+
+the order m > 0 propagates if m < u, and the order m < 0 if −m < v. e jumps where u or v is a whole number, and is
+continuous between. Each unit square of (u, v) is therefore divided into grid cells separately. They are finest near its
+lower edges, where an order is just above the horizon; at u = 0 and v = 0, ω itself is at the horizon. With f the
+fractional part of u, nodes are equidistant in √f, which is proportional to cos θ_o of that order. a depends on u and v
+alone, except where lobes meet the horizon: in units of c, their width is proportional to 1/c. The table has one slice.
+
+For surfaces with orders in two dimensions, for samples and for interfaces the hemisphere is mapped to a square, with
+the normal at its centre and the horizon at its edge,
+
+    (ω_x − ω_y, ω_x + ω_y) (1 − t)/(|ω_x| + |ω_y|),    cos θ = 1 − (1 − t²)²
+
+Its nodes are equidistant along the sides, and its slices are equidistant in 1/λ. An interface has tables for light from
+above and from below. The tables of reflected light hold 1/a up to `MAX_E`, so that interpolation does not smooth the
+kink of e at a = 1.
+
+Scaling lengths by s and heights by h is equivalent to scaling heights by r = h/s at the wavelength λ/s: where scales
+vary, the table has nodes in r.
+"""
+
+from __future__ import annotations
+
+import base64
+import binascii
+import dataclasses
+import zlib
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ..errors import RequestError
+from ..spectrum.grids import OrderGrid
+from ..spectrum.power_spectrum import PowerSpectrum
+from .furnace import Furnace, Real
+
+MAX_E = 1.05
+"""Maximum stored 1/a; e is one where the interpolated value exceeds one, so that its kink lies at a = 1."""
+MAX_LINE_NODES = 1.2e5  # nodes of the table of a line grating, about
+MAX_NODES = 100000  # nodes of any other table
+MAX_NODE_COMPONENT_PAIRS = 3e7  # evaluations for a table with one ratio
+SLICES = 16  # nodes of 1/λ
+MIN_FRACTION = 1e-7  # distance of nodes from whole u and v
+MIN_T = 0.01  # t of nodes at the horizon
+
+
+@dataclass(frozen=True)
+class Layout:
+    """The nodes of a table.
+
+    Attributes:
+        period: T in µm of a line grating; 0 for any other surface.
+        squares: number of unit squares of (u, v) along u and along v; 1 for the square of all directions.
+        first: number of grid cells from u or v = 0 to 1, where ω is near the horizon; else along a side of the square.
+        cells: number of grid cells along a side of each other unit square.
+        slices: 1, or the number of nodes in 1/λ.
+        frequencies: (minimum, maximum) of 1/λ in 1/µm.
+        turned: whether the grating is periodic along y, so that x and y are exchanged.
+    """
+
+    period: float
+    squares: int
+    first: int
+    cells: int
+    slices: int
+    frequencies: tuple[float, float]
+    turned: bool = False
+
+    def __post_init__(self) -> None:
+        if not (0 <= self.period < np.inf and 0 < self.frequencies[0] < self.frequencies[1] < np.inf):
+            raise RequestError(f"energy table: got period {self.period}, frequencies {self.frequencies}")
+        if min(self.squares, self.first, self.cells, self.slices - (not self.lines)) < 1:
+            raise RequestError(
+                f"energy table: got {self.squares}, {self.first}, {self.cells}, {self.slices}, wanted at least one each"
+            )
+
+    @property
+    def lines(self) -> bool:
+        """Whether the table is that of a line grating."""
+        return self.period > 0
+
+    @property
+    def side(self) -> int:
+        """Number of grid cells along u or v, or along a side of the square."""
+        return self.first + (self.squares - 1) * self.cells
+
+    @property
+    def shape(self) -> tuple[int, int, int]:
+        """(slices, nodes along v, nodes along u); unit squares share no nodes."""
+        return self.slices, self.side + self.squares, self.side + self.squares
+
+    @classmethod
+    def of(cls, furnace: Furnace, min_lateral_scale: float = 1.0) -> Layout:
+        """Choose the layout: as fine as `MAX_NODES` and `MAX_NODE_COMPONENT_PAIRS` allow."""
+        spectrum, grid = furnace.spectrum, furnace.spectrum.grid
+        min_frequency, max_frequency = frequencies_of(spectrum, furnace.index)
+        frequencies = min_frequency * min(min_lateral_scale, 1), max_frequency
+        if furnace.index is not None or not (isinstance(grid, OrderGrid) and 1 in grid.shape):
+            nodes = min(MAX_NODE_COMPONENT_PAIRS / (len(furnace.q) * (1 if furnace.index is None else 6)), MAX_NODES)
+            return cls(0.0, 1, max(int(np.sqrt(nodes / SLICES)) - 1, 8), 1, SLICES, frequencies)
+        turned = grid.shape[1] == 1 and grid.shape[0] > 1
+        # In about half of the unit squares 1/λ is in range.
+        side = np.sqrt(2 * min(MAX_LINE_NODES, MAX_NODE_COMPONENT_PAIRS / max(len(furnace.q) / 2, 1)))
+        first = int(np.clip(side / 8, 4, 24))
+        period, rest = grid.tile_size[int(turned)], (side - 2 * first - 1) / 3
+        period /= max(np.ceil(2 * period * max_frequency / max(rest, 2)), 1)
+        squares = int(np.ceil(2 * period * max_frequency))
+        cells = int(np.clip((3 * rest / max(squares - 1, 1) - 1) / 2, 1, 48))
+        return cls(float(period), squares, first, cells, 1, frequencies, turned)
+
+    @property
+    def squares_of_cells(self) -> NDArray[np.int64]:
+        """The index s_k of the unit square of each grid cell k along u or v; its nodes are k + s_k and k + s_k + 1."""
+        return np.repeat(np.arange(self.squares), [self.first] + [self.cells] * (self.squares - 1))
+
+    def corners(self) -> list[tuple[Any, ...]]:
+        """Return the indices of the corners of all grid cells in an array (..., *shape), from slices to columns."""
+        start = np.arange(self.side) + self.squares_of_cells
+        count = max(self.slices - 1, 1)
+        return [
+            (..., slice(k, k + count), start[:, None] + j, start + i)
+            for k, j, i in np.ndindex(min(self.slices, 2), 2, 2)
+        ]
+
+    def nodes(self) -> Real:
+        """Return the coordinates of all nodes, (n, 3), in the order of `shape`, for `directions`."""
+        return self._points(0.0)
+
+    def centres(self) -> Real:
+        """Return the coordinates of the centres of all grid cells, likewise, (n, 3)."""
+        return self._points(0.5)
+
+    def _points(self, offset: float) -> Real:
+        """Return coordinates of points in grid cells, of the next node with `offset` 0; (n, 3)."""
+        last = 1 if offset == 0 else 0
+        slices = np.arange(self.slices + last - 1) + offset if self.slices > 1 else np.zeros(1)
+        axis = np.arange(self.first + last) + offset
+        if self.lines:
+            counts = [self.first] + [self.cells] * (self.squares - 1)
+            fractions = [((np.arange(count + last) + offset) / count) ** 2 for count in counts]
+            axis = np.concatenate([j + f.clip(MIN_FRACTION, 1 - MIN_FRACTION) for j, f in enumerate(fractions)])
+        return np.stack(np.meshgrid(slices, axis, axis, indexing="ij"), -1).reshape(-1, 3)
+
+    def directions(self, coordinates: Real, frequency: float = np.inf) -> tuple[Real, Real]:
+        """Return ω (n, 3) and λ in µm (n,) at coordinates (n, 3): slice, row and column in grid cells; or 0, v and u.
+
+        Many directions of a line grating have the same u and v. Of those whose 1/λ is in the range of the table, the
+        one with 1/λ closest to `frequency` is returned.
+        """
+        first, last = self.frequencies
+        nu, row, column = coordinates.T
+        if self.lines:
+            nu = (row + column) / (2 * self.period)
+            c = np.minimum(nu / np.clip(frequency, first, last), 1)
+            x = (row - column) / (row + column)
+            x, y, z = c * x, np.sqrt(1 - c**2), c * np.sqrt(1 - x**2)
+            return np.stack([y, x, z] if self.turned else [x, y, z], -1), c / nu
+        row, column = (2 * x / self.first - 1 for x in (row, column))
+        x, y = (column + row) / 2, (column - row) / 2
+        t = np.maximum(1 - np.abs(x) - np.abs(y), MIN_T)
+        z = 1 - (1 - t**2) ** 2
+        along = np.sqrt(1 - z**2) / np.maximum(np.hypot(x, y), 1e-12)
+        return np.stack([along * x, along * y, z], -1), 1 / (first + nu / (self.slices - 1) * (last - first))
+
+
+@dataclass(frozen=True, eq=False)
+class EnergyTable:
+    """The factor e at nodes, linear between them.
+
+    Attributes:
+        layout: the nodes of directions and wavelengths.
+        ratios: the nodes of h/s, equidistant.
+        values: uint8 (ratios, channels, *layout.shape): e = min(1, `MAX_E`/255 · value). There is one channel; or for
+            an interface four: light from above, reflected and transmitted, and light from below, likewise.
+    """
+
+    layout: Layout
+    values: NDArray[np.uint8] = field(repr=False)
+    ratios: tuple[float, ...] = (1.0,)
+
+    def __post_init__(self) -> None:
+        got, wanted = self.values, (len(self.ratios), self.values.shape[1], *self.layout.shape)
+        if got.shape != wanted or got.dtype != np.uint8:
+            raise RequestError(f"energy table: got {got.dtype} {got.shape}, wanted uint8 {wanted}")
+        got.setflags(write=False)
+
+    @classmethod
+    def of(
+        cls,
+        spectrum: PowerSpectrum,
+        ratios: Sequence[float] = (1.0,),
+        index: float | None = None,
+        min_lateral_scale: float = 1.0,
+    ) -> EnergyTable:
+        """Compute the table of `spectrum`.
+
+        Args:
+            spectrum: S(q; κ); for an interface, of wavelengths in the denser medium.
+            ratios: the nodes of h/s, equidistant.
+            index: n below relative to n above, if light is transmitted.
+            min_lateral_scale: the minimum of s.
+        """
+        sides = [Furnace.of(spectrum, max(ratios), index, side) for side in ((1,) if index is None else (1, -1))]
+        layout = Layout.of(sides[0], min_lateral_scale)
+        e = _bounds(layout, sides, ratios, layout.nodes()).reshape(len(ratios), -1, *layout.shape)
+        # e varies fast where an order is just above the horizon, and in deep reliefs: where it is less at the centre of
+        # a grid cell than between the corners, they are lowered by the difference.
+        corners = layout.corners()
+        of_centres = _bounds(layout, sides, ratios, layout.centres()).reshape(e[corners[0]].shape)
+        excess = np.where(of_centres < 1, np.mean([e[corner] for corner in corners], axis=0) - of_centres, 0)
+        lowered = e.copy()
+        for corner in corners:
+            lowered[corner] = np.minimum(lowered[corner], e[corner] - np.maximum(excess, 0))
+        values = np.rint(np.clip(lowered, 0, MAX_E) * (255 / MAX_E)).astype(np.uint8)
+        return cls(layout, values, tuple(ratios))
+
+    @property
+    def needed(self) -> bool:
+        """Whether the albedo exceeds one for any direction."""
+        return bool(self.values.min() * (MAX_E / 255) < 1)
+
+    def corners(self) -> NDArray[np.uint8]:
+        """Return the values at the corners (u, v), (u⁺, v), (u, v⁺), (u⁺, v⁺) of grid cells.
+
+        Returns:
+            (ratios, channels, slices, side, side, 4).
+        """
+        start = np.arange(self.layout.side) + self.layout.squares_of_cells
+        return np.stack([self.values[..., start[:, None] + j, start + i] for j, i in np.ndindex(2, 2)], -1)
+
+    def as_plain(self) -> dict[str, Any]:
+        """Return a table of one channel and one ratio as numbers and strings, for JSON."""
+        packed = base64.b64encode(zlib.compress(self.values.tobytes(), 9)).decode("ascii")
+        return {"layout": dataclasses.asdict(self.layout), "values": packed}
+
+    @classmethod
+    def from_plain(cls, plain: Mapping[str, Any]) -> EnergyTable:
+        """Return the table that `as_plain` describes.
+
+        Raises:
+            ValueError, TypeError or KeyError: if it is not a table.
+        """
+        if plain.keys() != {"layout", "values"}:
+            raise RequestError(f"energy table: got {', '.join(plain)}, wanted layout, values")
+        layout = Layout(**{**plain["layout"], "frequencies": tuple(plain["layout"]["frequencies"])})
+        size = int(np.prod(layout.shape, dtype=np.int64))
+        try:
+            # A limit, as a damaged file may expand without end.
+            content = zlib.decompressobj().decompress(base64.b64decode(plain["values"]), size + 1)
+        except (zlib.error, binascii.Error) as error:
+            raise RequestError(f"energy table: {error}") from None
+        if not 0 < size < 1 << 26 or len(content) != size:
+            raise RequestError(f"energy table: got {len(content)} bytes, wanted {size}")
+        return cls(layout, np.frombuffer(content, np.uint8).reshape(1, 1, *layout.shape))
+
+
+def _bounds(layout: Layout, sides: Sequence[Furnace], ratios: Sequence[float], points: Real) -> Real:
+    """Return e at coordinates of nodes or centres of a layout, (ratios, channels, n)."""
+    used, step, grid = np.ones(len(points), bool), 0, sides[0].spectrum.grid
+    if layout.lines:
+        # u + v = 2cT/λ
+        used = np.floor(points[:, 1:]).sum(-1) < 2 * layout.period * layout.frequencies[1]
+    elif isinstance(grid, OrderGrid) and 1 in grid.shape:
+        # Symmetric along the grooves, as rows and columns are exchanged, in reverse where the grooves are along x.
+        _, row, column = points.T
+        step = 1 if grid.shape[0] == 1 else -1
+        used = row <= column if step == 1 else row + column <= layout.side
+    omega, wavelengths = layout.directions(points[used], float(np.mean(layout.frequencies)))
+    e = np.ones((len(ratios), sum(len(side.branches[:2]) for side in sides), len(points)))
+    for k, ratio in enumerate(ratios):
+        bounds = [
+            bounds_of(dataclasses.replace(side, height_scale=ratio).albedo(omega, wavelengths / n), side.index)
+            for side, n in zip(sides, (1.0, sides[0].index or 1.0), strict=False)
+        ]
+        e[k, :, used] = np.concatenate(bounds).T
+    if step:
+        side = len(np.unique(points[:, 1]))
+        mirrored = e.reshape(*e.shape[:2], -1, side, side)[..., ::step, ::step].swapaxes(-1, -2)
+        e = np.where(used, e, mirrored.reshape(e.shape))
+    return e
+
+
+def frequencies_of(spectrum: PowerSpectrum, index: float | None) -> tuple[float, float]:
+    """Return (minimum, maximum) of 1/λ in 1/µm for a table; `index` is η of `Furnace`."""
+    # The wavelengths of the spectrum are in the denser medium.
+    shortest, longest = (w * 1e-3 * max(index or 1, 1) for w in spectrum.wavelengths)
+    return 1 / longest, 1 / shortest
+
+
+def bounds_of(albedo: Real, index: float | None) -> Real:
+    """Return e from the albedo of the furnace.
+
+    For reflected light alone e = 1/max(1, a). For an interface, transmitted light has priority over all reflected light
+    except F₀, the reflectance of a plane at normal incidence, since scalar theory transmits even light that steep
+    facets reflect totally:
+
+        e_T = min(1, (1 − min(R, F₀))/T),    e_R = min(1, (1 − e_T T)/R),    e_R R + e_T T = min(1, R + T)
+
+    Args:
+        albedo: (1, n), or R and T (2, n).
+        index: η; None for reflected light alone.
+
+    Returns:
+        Shape of `albedo`; for reflected light alone up to `MAX_E`.
+    """
+    if index is None:
+        return np.minimum(1 / np.maximum(albedo, 1e-9), MAX_E)
+    r, t = albedo
+    # At most one: e_R is so steep at its kink that larger values would err by more between nodes.
+    e_t = np.minimum(1, (1 - np.minimum(r, ((index - 1) / (index + 1)) ** 2)) / np.maximum(t, 1e-9))
+    return np.stack([np.minimum(1, (1 - e_t * t) / np.maximum(r, 1e-9)), e_t])
