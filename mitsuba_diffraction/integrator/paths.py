@@ -440,8 +440,9 @@ class LightPaths:
         cos_ratio = dr.select(deflected, dr.abs(ratio(dr.dot(si.wi, normal), dr.dot(bs.wo, normal))), 1)
         cos_ratio_shading = dr.abs(ratio(mi.Frame3f.cos_theta(si.wi), mi.Frame3f.cos_theta(bs.wo)))
         weight *= dr.select(specular, cos_ratio, cos_ratio_shading)
-        # Other BSDFs may not be reciprocal, or may perturb the normal themselves.
-        evaluates_reverse = active & ((specular | reciprocal) ^ True)
+        # Other BSDFs may not be reciprocal, or may perturb the normal themselves. The direction of a failed sample has
+        # no meaning, and may be one in which the perturbed BSDF is not zero.
+        evaluates_reverse = active & (bs.pdf > 0) & ((specular | reciprocal) ^ True)
         value = bsdf.eval(mi.BSDFContext(), _with_wi(si, bs.wo), si.wi, evaluates_reverse)
         weight = dr.select(evaluates_reverse, value * ratio(1, bsdf.pdf(ctx, si, bs.wo, evaluates_reverse)), weight)
         weight *= dr.abs(ratio(dr.dot(ray.d, si.n), dr.dot(si.to_world(si.wi), si.n)))
