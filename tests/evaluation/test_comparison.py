@@ -383,7 +383,7 @@ def test_compare_writes_pictures_numbers_and_a_figure(command, llvm, folder):
 @pytest.mark.slow
 def test_a_coat_is_noted(llvm, folder):
     write(Path("scene.xml"), base=BASE + '<float name="coat_ior" value="1.5"/>')
-    found = compare("scene.xml", "flss", width=4, spp=1, shading_points=1, shares=False)
+    found = compare("scene.xml", "flss", width=4, spp=1, shading_points=1, shares=False, brightness=1000, pigment=True)
     assert found.coated
     for coated in (True, False):
         heads = [line.split(":")[0] for line in summary.notes(replace(found, coated=coated))]
