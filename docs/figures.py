@@ -104,7 +104,7 @@ FIGURES = (
     picture_error("blaze", "parallel"),
     picture_error("xenopeltis_sphere", "bulb", "-D skin=xenopeltis_tile"),
     picture_error("xenopeltis_sphere", "parallel", "-D skin=xenopeltis_tile"),
-    Figure(("ready_surfaces.png",), "python precompute/contact_sheet.py {out}/ready_surfaces.png", 3),
+    Figure(("ready_surfaces.jpg",), "python precompute/contact_sheet.py {out}/ready_surfaces.png", 3),
     Figure(("removed_dust.png",), "python precompute/measured_skins.py {out}/removed_dust.png"),
     notebook("scalar_theory.png", "05_can_i_trust_the_picture", "cell-07", 3),
     Figure(

@@ -12,13 +12,14 @@ distances in the spectrum, and the rendering is shown in it.
 from __future__ import annotations
 
 import argparse
+from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 
 import colour
 import numpy as np
 from numpy.typing import NDArray
-from PIL import Image
+from PIL import Image, ImageDraw, ImageFont
 from scipy import ndimage
 
 from mitsuba_diffraction.color import into_gamut, spectrum_to_linear_sRGB
@@ -30,7 +31,7 @@ SCREEN_WIDTH = 130.0
 """mm, of the screen that the rendering shows from edge to edge."""
 SPECTRUM, ROWS = (0.35, 0.8), (0.09, 0.19)
 """Where the orders are searched, as distances from the mirror direction relative to the width of the photograph."""
-WIDTH = 650  # pixels of the figure
+WIDTH, GAP = 650, 8  # pixels of the figure, and between its pictures
 
 Array = NDArray[np.float64]
 
@@ -74,6 +75,18 @@ def _brightest(values: Array, first: int, last: int) -> float:
     return float(first + np.flatnonzero(values > 0.9 * values.max()).mean())
 
 
+def labelled(pictures: Mapping[str, NDArray[np.uint8]]) -> Image.Image:
+    """Return pictures of one size, (rows, columns, 3) sRGB, one below the other, each with its name."""
+    rows, columns = next(iter(pictures.values())).shape[:2]
+    result = Image.new("RGB", (columns, len(pictures) * (rows + GAP) - GAP), "white")
+    draw = ImageDraw.Draw(result)
+    for index, (name, picture) in enumerate(pictures.items()):
+        top = index * (rows + GAP)
+        result.paste(Image.fromarray(picture), (0, top))
+        draw.text((columns - 12, top + rows - 10), name, "white", ImageFont.load_default(20), anchor="rs")
+    return result
+
+
 def main() -> None:
     """Read the command line."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
@@ -113,12 +126,11 @@ def main() -> None:
     start, end = (round(photograph.mirror[0] / factor + fraction * WIDTH) for fraction in SPECTRUM)
     middle = round(photograph.mirror[1] / factor)
     below /= below[middle - 3 : middle + 4, start:end, 1].mean(0).max()
-    above, gap = np.asarray(shown.resize((WIDTH, height))), np.full((8, WIDTH, 3), 255, np.uint8)
     # Saturated as by a camera.
     below = np.rint(255 * colour.cctf_encoding(np.clip(below, 0, 1), function="sRGB")).astype(np.uint8)
-    figure = np.vstack([above, gap, below])
+    figure = labelled({"photograph": np.asarray(shown.resize((WIDTH, height))), "rendering": below})
     with whole_file(arguments.figure) as temporary:
-        Image.fromarray(figure).save(temporary, "PNG", optimize=True)
+        figure.save(temporary, "PNG", optimize=True)
 
 
 if __name__ == "__main__":

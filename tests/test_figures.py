@@ -9,8 +9,9 @@ import pytest
 
 ROOT = Path(__file__).parents[1]
 DOCS = ROOT / "docs"
-sys.path.insert(0, str(DOCS))
+sys.path[:0] = [str(DOCS), str(ROOT / "precompute")]
 
+import contact_sheet  # noqa: E402
 import figures  # noqa: E402
 
 TABLE = list(figures.figures())
@@ -28,6 +29,11 @@ def test_the_manual_shows_every_figure():
     for figure in TABLE:
         for file in figure.files:
             assert re.search(rf"\]\((?:[\w./]*/)?{re.escape(file)}\)", text), file
+
+
+def test_the_catalogue_shows_every_recipe():
+    recipes = {path.stem for path in (ROOT / "precompute").glob("*.toml")}
+    assert {name for name in recipes if not name.endswith("_tile")} == set(contact_sheet.PANELS)
 
 
 def test_what_the_commands_name_exists(command):

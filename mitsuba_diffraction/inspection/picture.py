@@ -77,30 +77,31 @@ def _headline(inspection: Inspection) -> str:
 
 
 def _height_map(axes: Axes, field: HeightField, extent: str) -> None:
-    """Plot heights about the mean plane, with a scale bar in place of axes."""
+    """Plot heights about the mean plane, +y upwards, with a scale bar in place of axes."""
     field = _square_cut(field)
     size_x, size_y = field.tile_size
     level = (field.heights - reference_plane(field, extent)[0]) * 1e3
     low, high = np.quantile(level, [0.002, 0.998])
     image = axes.imshow(
         level,
-        extent=(0, size_x, size_y, 0),
+        extent=(0, size_x, 0, size_y),
+        origin="lower",
         cmap="cividis",
         vmin=low,
         vmax=max(high, low + 1e-3),
         aspect="equal",
         interpolation="nearest",
     )
-    axes.set(xticks=[], yticks=[], anchor="NW")
+    axes.set(xticks=[], yticks=[], anchor="NW", xlabel="x →", ylabel="y →")
     axes.set_title("The surface", fontsize=12, loc="left")
     bar = axes.figure.colorbar(image, cax=axes.inset_axes([1.03, 0, 0.05, 1]))
     bar.set_label("height, nm", fontsize=10)
     bar.ax.tick_params(labelsize=9)
     length = _round_length(size_x / 4)
-    y = size_y * 0.94
+    y = size_y * 0.06
     box = {"facecolor": "black", "alpha": 0.6, "edgecolor": "none", "pad": 3}
     axes.plot([size_x * 0.05, size_x * 0.05 + length], [y, y], color="white", lw=4, solid_capstyle="butt")
-    axes.text(size_x * 0.05, y - size_y * 0.04, f"{length:g} µm", color="white", fontsize=11, va="bottom", bbox=box)
+    axes.text(size_x * 0.05, y + size_y * 0.04, f"{length:g} µm", color="white", fontsize=11, va="bottom", bbox=box)
 
 
 def _shown(inspection: Inspection) -> HeightField:
@@ -155,9 +156,9 @@ def _spectrum(axes: Axes, inspection: Inspection) -> None:
     top = power.max()
     decibel = np.log10(np.maximum(power / top, 10.0**-_DECADES)) if top > 0 else np.full_like(power, -_DECADES)
     axes.pcolormesh(q_x, q_y, decibel, cmap="magma", vmin=-_DECADES, vmax=0, shading="nearest", rasterized=True)
-    axes.set(xlim=(-limit, limit), ylim=(limit, -limit), aspect="equal", facecolor="black")
+    axes.set(xlim=(-limit, limit), ylim=(-limit, limit), aspect="equal", facecolor="black")
     axes.set_xlabel("cycles/µm along x", fontsize=10)
-    axes.set_ylabel("cycles/µm along y (down)", fontsize=10)
+    axes.set_ylabel("cycles/µm along y", fontsize=10)
     axes.tick_params(labelsize=9)
     axes.set_title("Its spectrum: spots are regular waves", fontsize=12, loc="left")
     # Labels are at spots of opposite sign, so that they do not overlap.
@@ -170,7 +171,7 @@ def _spectrum(axes: Axes, inspection: Inspection) -> None:
         axes.annotate(
             f"{period.period:.3g} µm",
             (x, y),
-            xytext=(side * 10, 10 if y <= 0 else -20),
+            xytext=(side * 10, 10 if y >= 0 else -20),
             textcoords="offset points",
             ha="left" if side > 0 else "right",
             color=colour,

@@ -9,13 +9,14 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 import pytest
+from matplotlib.figure import Figure
 from PIL import Image
 from scipy.special import jv
 
 import mitsuba_diffraction as md
 from mitsuba_diffraction import testing
 from mitsuba_diffraction.color import into_gamut, spectrum_to_linear_sRGB, spectrum_to_XYZ
-from mitsuba_diffraction.inspection import inspect, save_picture
+from mitsuba_diffraction.inspection import inspect, picture, save_picture
 from mitsuba_diffraction.inspection.colours import (
     WAVELENGTHS,
     broadened,
@@ -593,3 +594,16 @@ def test_the_notebook_runs_and_prints_what_it_shows(monkeypatch, capsys, whole):
     assert sum("image/png" in output.get("data", {}) for cell in cells for output in cell["outputs"]) == 3
     # Colours, not greys.
     assert np.ptp(names["picture"], axis=2).max() > 0.1 * names["picture"].max()
+
+
+def test_figures_show_y_upwards():
+    """Row 0, at the lowest y, is at the bottom."""
+    heights = np.zeros((32, 32))
+    heights[0] = 0.1
+    axes = Figure().add_subplot()
+    picture._height_map(axes, md.HeightField(heights, 0.1), "tile")
+    (image,) = axes.images
+    assert image.get_array()[0].min() > image.get_array()[1:].max()
+    assert image.origin == "lower"
+    bottom, top = axes.get_ylim()
+    assert bottom < top

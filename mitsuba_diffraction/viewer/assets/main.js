@@ -201,7 +201,7 @@ async function start() {
 }
 
 function show(renderer, state) {
-  const of = (side) => (Number.isNaN(side.milliseconds) ? "…" : `${side.milliseconds.toPrecision(3)} ms`);
+  const of = (side) => (Number.isNaN(side.milliseconds) ? "…" : `${Number(side.milliseconds.toPrecision(3))} ms`);
   const drawing = Boolean(renderer.shader) && renderer.shader.frame === 0;
   $("drawing").hidden = !drawing;
   showLamp(state, renderer.width, renderer.height);
