@@ -26,7 +26,7 @@ class SplineSpectrum:
 
     resolved = False
 
-    def __init__(self, spectrum: GratingSpectrum, typical_max_kappa: float | None = None) -> None:
+    def __init__(self, spectrum: GratingSpectrum, sampler: BinSampler) -> None:
         grid = cast(SplineGrid, spectrum.grid)
         self.power = SlicePower(cast(SliceTable, spectrum.table), (RIM, RIM))
         self.max_node_x, self.max_node_y = grid.max_order
@@ -34,7 +34,7 @@ class SplineSpectrum:
         self.per_area = opaque(1 / (grid.spacing[0] * grid.spacing[1]))
         self.limit_x, self.limit_y = (opaque(limit) for limit in grid.limit)
         self.per_width = opaque(1 / spectrum.lobe_width)
-        self.q_sampler = BinSampler(spectrum, typical_max_kappa)
+        self.sampler = sampler
 
     def meets(self, q_x: mi.Float, q_y: mi.Float, scale: mi.Float | float) -> mi.Bool:
         """Return true: a continuum has no gaps."""
@@ -68,7 +68,7 @@ class SplineSpectrum:
             * self.per_area
             * geometry.continuum_factor(incidence, incidence.frequency * self.per_width)
         )
-        return dr.select(inside, power, 0), self.q_sampler.density(incidence.q_sign * q, incidence, active)
+        return dr.select(inside, power, 0), self.sampler.density(incidence.q_sign * q, incidence, active)
 
     def sample(
         self,
@@ -78,4 +78,4 @@ class SplineSpectrum:
         active: mi.Bool,
     ) -> tuple[mi.Point2f, mi.Bool]:
         """Draw q in cycles/µm, for one wavelength; as no order is chosen, none is evanescent."""
-        return self.q_sampler.sample(incidence, u, v, active), active
+        return self.sampler.sample(incidence, u, v, active), active

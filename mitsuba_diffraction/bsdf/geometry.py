@@ -77,9 +77,10 @@ class Interface:
         eta: index below relative to that above; None where no light is transmitted.
         transmits: whether there is a medium below.
         is_sheet: whether the lower medium is a film with a flat lower face, with the upper medium below it.
-        kappas: the two bounds whose minimum is κ₁, in rad/µm for unscaled heights (`furnace.small_kappas`). None in
-            reflection and for rigorous theory, whose tables do not depend on the sign of κ and include the flat face of
-            a sheet.
+        rigorous: whether tables are of rigorous theory: these do not depend on the sign of κ, include the flat face of
+            a sheet, and are less like a plane.
+        kappas: the two bounds whose minimum is κ₁, in rad/µm for unscaled heights (`furnace.small_kappas`); None where
+            κ₁ is zero, in reflection and for rigorous theory.
         transmitted_fraction: returns the transmitted fraction of power for a direction along the pattern's axes, where
             an `OrderSampler` draws orders; None for rigorous theory and where orders overlap, which use that of a
             plane.
@@ -90,18 +91,19 @@ class Interface:
         coat_index: mi.Float | float = 1.0,
         eta: mi.Float | None = None,
         is_sheet: bool = False,
+        rigorous: bool = False,
         kappas: tuple[mi.Float, mi.Float] | None = None,
         transmitted_fraction: Callable[[mi.Vector3f], mi.Float] | None = None,
     ) -> None:
         self.coat_index, self.transmits, self.is_sheet = mi.Float(coat_index), eta is not None, is_sheet
-        self.kappas, self.transmitted_fraction = kappas, transmitted_fraction
+        self.rigorous, self.kappas, self.transmitted_fraction = rigorous, kappas, transmitted_fraction
         # In reflection literals, so that Dr.Jit eliminates the terms of the medium below.
         self.eta = mi.Float(1.0) if eta is None else eta
         self.per_eta, self.excess = dr.rcp(self.eta), dr.square(self.eta) - 1
         self._per_coat, self._coat_excess = dr.rcp(self.coat_index), dr.square(self.coat_index) - 1
 
     def min_kappa(self, height_scale: mi.Float) -> mi.Float:
-        """Return κ₁ in rad/µm, at most the κ of the undiffracted order at all wavelengths; 0 in reflection."""
+        """Return κ₁ in rad/µm, at most the κ of the undiffracted order at all wavelengths."""
         if self.kappas is None:
             return mi.Float(0.0)
         first, undiffracted = self.kappas
@@ -110,7 +112,7 @@ class Interface:
     @property
     def kappa_has_sign(self) -> bool:
         """Whether tables are read at −q where κ is negative."""
-        return self.kappas is not None
+        return self.transmits and not self.rigorous
 
     @property
     def mirrors_q(self) -> bool:
@@ -120,7 +122,7 @@ class Interface:
     @property
     def has_flat_face(self) -> bool:
         """Whether there is a flat face that the tables do not include."""
-        return self.is_sheet and self.kappas is not None
+        return self.is_sheet and not self.rigorous
 
     def is_incident(self, cos: mi.Float) -> mi.Bool:
         """Return whether light that is incident from a direction with this cosine is scattered."""
@@ -155,7 +157,7 @@ class Interface:
             return limited(self.transmitted_fraction(omega), MIN_TABULATED_PROBABILITY, 1 - MIN_TABULATED_PROBABILITY)
         # In a sheet no transmitted light is totally reflected.
         reflected = mi.fresnel(dr.abs(omega.z) if self.is_sheet else omega.z, self.eta)[0]
-        min_probability = MIN_RIGOROUS_PROBABILITY if self.kappas is None else MIN_PLANE_PROBABILITY
+        min_probability = MIN_RIGOROUS_PROBABILITY if self.rigorous else MIN_PLANE_PROBABILITY
         return limited(1 - reflected, min_probability, 1 - min_probability)
 
     def flat_face_transmittance(self, omega: mi.Vector3f) -> mi.Float:
@@ -205,8 +207,16 @@ class Geometry:
         kappa_sign = dr.select(v_z < 0, mi.Float(-1), 1) if interface.kappa_has_sign else mi.Float(1.0)
         height_scale = mi.Float(height_scale)
         return cls(
-            *(k_i, k_o, k_i.sign == k_o.sign, v_z, kappa_sign, -kappa_sign * along, height_scale, shadowing),
-            *(interface.min_kappa(height_scale), interface.coat_index),
+            incident=k_i,
+            outgoing=k_o,
+            reflects=k_i.sign == k_o.sign,
+            v_z=v_z,
+            kappa_sign=kappa_sign,
+            tangent=-kappa_sign * along,
+            height_scale=height_scale,
+            shadowing=shadowing,
+            min_kappa=interface.min_kappa(height_scale),
+            coat_index=interface.coat_index,
         )
 
     @property
@@ -413,25 +423,25 @@ class Incidence:
         undiffracted, steep = (dr.abs(k_i.z + k_o.sign * z) for z in (snell, 0.7 * snell))
         near_undiffracted = smaller(undiffracted, steep), dr.rcp(larger(dr.abs(undiffracted - steep), 1e-4))
         horizon, normal = k_o.normal(mi.Float(0)), k_o.inner_index
-        values = (
-            assumed_sign * k_i.tangent,
-            mi.Float(1.0),
-            mi.Float(1.0),
-            mi.Float(1.0),
-            interface.coat_index,
-            k_i.sign > 0,
-            reflects,
-            k_i.index,
-            k_o.index,
-            assumed_sign * kappa_sign,
-            square,
-            mi.Float(height_scale),
-            dr.rcp(larger(dr.two_pi * mi.Float(height_scale), 1e-30)),
-            near_undiffracted,
-            dr.abs(k_i.z),
-            (horizon, normal, dr.rcp(larger(normal - horizon, 1e-3))),
+        incidence = cls(
+            tangent=assumed_sign * k_i.tangent,
+            wavelength=mi.Float(1.0),
+            frequency=mi.Float(1.0),
+            lobe_scale=mi.Float(1.0),
+            coat_index=interface.coat_index,
+            above=k_i.sign > 0,
+            reflects=reflects,
+            index=k_i.index,
+            radius=k_o.index,
+            q_sign=assumed_sign * kappa_sign,
+            square=square,
+            height_scale=mi.Float(height_scale),
+            per_kappa=dr.rcp(larger(dr.two_pi * mi.Float(height_scale), 1e-30)),
+            near_undiffracted=near_undiffracted,
+            k_iz=dr.abs(k_i.z),
+            k_oz=(horizon, normal, dr.rcp(larger(normal - horizon, 1e-3))),
         )
-        return cls(*(dr.detach(value) for value in values))
+        return dr.detach(incidence)
 
     def fraction_below(self, kappa: mi.Float) -> mi.Float:
         """Return the assumed fraction of light with less than κ (rad/µm).

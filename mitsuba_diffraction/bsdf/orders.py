@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import copy
 from collections.abc import Sequence
 from typing import cast
 
@@ -283,6 +282,40 @@ def _hermite(
 MAX_DRAWN_LOBE_WIDTH = 0.03
 
 
+class OrderTable:
+    """The orders of a tile: their lobes and powers.
+
+    Attributes:
+        axes: the orders along x and y.
+        resolved: whether at most one order contributes at q, and an order is drawn instead of q.
+        is_line: whether there is one order along x or y.
+        power: η_m(κ).
+        per_width: 1/σ_q.
+    """
+
+    def __init__(self, spectrum: GratingSpectrum) -> None:
+        grid, sigma = cast(OrderGrid, spectrum.grid), spectrum.lobe_width
+        self.axes = tuple(
+            _Axis(lobe, size, max_order, sigma)
+            for lobe, size, max_order in zip(spectrum.lobes, grid.tile_size, grid.max_order, strict=True)
+        )
+        self.is_line = 1 in grid.shape
+        is_wide = self.is_line and sigma > MAX_DRAWN_LOBE_WIDTH
+        self.resolved = all(axis.count == 1 for axis in self.axes) and not is_wide
+        self.power: AmplitudePower | SlicePower
+        rim, windows = (self.axes[0].rim, self.axes[1].rim), not self.resolved
+        if isinstance(spectrum.table, AmplitudeTable):
+            self.power = AmplitudePower(spectrum.table, rim, windows=windows)
+        else:
+            self.power = SlicePower(spectrum.table, rim, windows=windows)
+        self.per_width = opaque(1 / sigma)
+
+    @property
+    def max_scale(self) -> float:
+        """The maximum lateral scale for which resolved orders stay so."""
+        return min((axis.max_scale for axis in self.axes if axis.max_order), default=np.inf)
+
+
 class OrderSpectrum:
     """S(q; κ) = Σ_m η_m(κ) N(q − m/T; σ_q² I), and the density from which q is drawn.
 
@@ -293,42 +326,11 @@ class OrderSpectrum:
     scales of a scene. For overlapping orders, and for line gratings with wide lobes, it is that of `BinSampler`.
 
     Lobes of resolved orders may be scaled.
-
-    Attributes:
-        order_sampler: of resolved orders, set by `with_order_sampler`.
     """
 
-    order_sampler: OrderSampler
-
-    def __init__(self, spectrum: GratingSpectrum, typical_max_kappa: float | None = None) -> None:
-        grid, sigma = cast(OrderGrid, spectrum.grid), spectrum.lobe_width
-        self.axes = tuple(
-            _Axis(lobe, size, max_order, sigma)
-            for lobe, size, max_order in zip(spectrum.lobes, grid.tile_size, grid.max_order, strict=True)
-        )
-        is_line = 1 in grid.shape
-        self.resolved = all(axis.count == 1 for axis in self.axes) and not (is_line and sigma > MAX_DRAWN_LOBE_WIDTH)
-        self.power: AmplitudePower | SlicePower
-        rim, windows = (self.axes[0].rim, self.axes[1].rim), not self.resolved
-        if isinstance(spectrum.table, AmplitudeTable):
-            self.power = AmplitudePower(spectrum.table, rim, windows=windows)
-        else:
-            self.power = SlicePower(spectrum.table, rim, windows=windows)
-        self.q_sampler = None if self.resolved else BinSampler(spectrum, typical_max_kappa)
-        self.is_line = is_line
-        self.per_width = opaque(1 / sigma)
-
-    def with_order_sampler(self, order_sampler: OrderSampler) -> OrderSpectrum:
-        """Return the same spectrum with orders drawn by a sampler."""
-        result = copy.copy(self)
-        result.order_sampler = order_sampler
-        return result
-
-    @property
-    def max_scale(self) -> float | None:
-        """The maximum lateral scale for which orders are resolved; None if they overlap without scaling."""
-        scales = (axis.max_scale for axis in self.axes if axis.max_order)
-        return min(scales, default=np.inf) if self.resolved else None
+    def __init__(self, table: OrderTable, sampler: OrderSampler | BinSampler) -> None:
+        self.axes, self.power, self.per_width = table.axes, table.power, table.per_width
+        self.resolved, self.is_line, self.sampler = table.resolved, table.is_line, sampler
 
     def meets(self, q_x: mi.Float, q_y: mi.Float, scale: mi.Float | float) -> mi.Bool:
         """Return whether q (cycles/µm) lies in the lobe, scaled by `scale`, of an order; true where lobes overlap."""
@@ -361,17 +363,17 @@ class OrderSpectrum:
         lobes_x, lobes_y = self.axes[0].lobes(m_x, q.x, scale), self.axes[1].lobes(m_y, q.y, scale)
         q_sign, factor = incidence.q_sign, 1
         # Each window of orders is read at one κ: offsets of its column and row, lobes along x and y, κ.
-        if self.q_sampler is None:
+        if isinstance(self.sampler, OrderSampler):
             tangent = self._tangent(m_x, m_y, incidence.wavelength)
             factor = geometry.order_factor(tangent, incidence, per_width)
             windows = [(0, 0, lobes_x, lobes_y, geometry.order_kappa(tangent, incidence))]
             m = (mi.Int32(q_sign) * m_x, mi.Int32(q_sign) * m_y)
-            probability = self.order_sampler.probability(*m, incidence, active)
+            probability = self.sampler.probability(*m, incidence, active)
             # Evanescent orders are not drawn.
             propagates = incidence.propagates(q_sign * tangent)
             density = dr.select(propagates, probability * lobes_x[0] * lobes_y[0], 0)
         else:
-            density = self.q_sampler.density(q_sign * q, incidence, active)
+            density = self.sampler.density(q_sign * q, incidence, active)
             if self.is_line:
                 windows = []
                 for x, y in np.ndindex(len(lobes_x), len(lobes_y)):
@@ -402,9 +404,9 @@ class OrderSpectrum:
         active: mi.Bool,
     ) -> tuple[mi.Point2f, mi.Bool]:
         """Draw q in cycles/µm, for one wavelength; return it and whether its order propagates."""
-        if self.q_sampler is not None:
-            return self.q_sampler.sample(incidence, u, v, active), active
-        m_x, m_y = self.order_sampler.sample(incidence, u, active)
+        if isinstance(self.sampler, BinSampler):
+            return self.sampler.sample(incidence, u, v, active), active
+        m_x, m_y = self.sampler.sample(incidence, u, active)
         tangent = self._tangent(m_x, m_y, incidence.wavelength)
         scale = incidence.lobe_scale
         q = mi.Point2f(self.axes[0].quantile(m_x, v.x, scale), self.axes[1].quantile(m_y, v.y, scale))

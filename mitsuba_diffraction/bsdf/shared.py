@@ -17,9 +17,10 @@ from ..rigorous.spectrum import RigorousSpectrum
 from ..settings import VISIBLE
 from ..spectrum.grids import OrderGrid
 from .continuum import SplineSpectrum
+from .continuum_sampler import BinSampler
 from .energy import Energy
 from .order_sampler import OrderSampler
-from .orders import OrderSpectrum
+from .orders import OrderSpectrum, OrderTable
 from .parameters import Scales
 from .rigorous_orders import RigorousOrders
 
@@ -35,19 +36,25 @@ class SharedTables:
     """The tables of one spectrum for all BSDFs that have it, in one variant of Mitsuba.
 
     Attributes:
-        scattering: S(q; κ) and its sampler.
+        table: of resolved orders without their sampler, which depends on the scene; else the powers with their sampler.
+        max_scale: the maximum lateral scale for which orders are resolved; None if they overlap without scaling.
     """
 
     def __init__(self, spectrum: Spectrum, eta: float | None) -> None:
-        self.scattering: OrderSpectrum | SplineSpectrum | RigorousOrders
+        self.table: OrderTable | OrderSpectrum | SplineSpectrum | RigorousOrders
+        self.max_scale: float | None = None
         if isinstance(spectrum, RigorousSpectrum):
-            self.scattering = RigorousOrders(spectrum)
+            self.table = RigorousOrders(spectrum)
         else:
-            represented = OrderSpectrum if isinstance(spectrum.grid, OrderGrid) else SplineSpectrum
-            self.scattering = represented(spectrum, *([] if eta is None else [typical_max_kappa(eta)]))
+            orders = OrderTable(spectrum) if isinstance(spectrum.grid, OrderGrid) else None
+            if orders is not None and orders.resolved:
+                self.table, self.max_scale = orders, orders.max_scale
+            else:
+                sampler = BinSampler(spectrum, None if eta is None else typical_max_kappa(eta))
+                self.table = SplineSpectrum(spectrum, sampler) if orders is None else OrderSpectrum(orders, sampler)
         self._spectrum, self._eta = spectrum, eta
         self._energy: tuple[tuple, Energy | None] | None = None
-        self._orders: tuple[tuple, OrderSampler] | None = None
+        self._drawn: tuple[tuple, OrderSpectrum] | None = None
         self._lock = threading.Lock()
 
     @classmethod
@@ -65,17 +72,20 @@ class SharedTables:
                 tables = _shared[key] = cls(spectrum, eta)
             return tables
 
-    def order_sampler(self, scales: Scales, is_sheet: bool = False, coat_index: float = 1.0) -> OrderSampler | None:
-        """Return the sampler of orders for the media and scales of a scene; None where orders overlap."""
-        if not self.scattering.resolved:
-            return None
+    def scattering(
+        self, scales: Scales, is_sheet: bool = False, coat_index: float = 1.0
+    ) -> OrderSpectrum | SplineSpectrum:
+        """Return the powers of scalar theory and their sampler, for the media and scales of a scene."""
+        if not isinstance(self.table, OrderTable):
+            return cast("OrderSpectrum | SplineSpectrum", self.table)
         low, high = scales.ratios()
         ratios = np.linspace(low, high, 1 if low == high else SAMPLER_RATIOS)
         key = is_sheet, coat_index, ratios.tolist(), scales.min_lateral
         with self._lock:
-            if self._orders is None or self._orders[0] != key:
-                self._orders = key, OrderSampler(cast(GratingSpectrum, self._spectrum), self._eta, *key)
-            return self._orders[1]
+            if self._drawn is None or self._drawn[0] != key:
+                sampler = OrderSampler(cast(GratingSpectrum, self._spectrum), self._eta, *key)
+                self._drawn = key, OrderSpectrum(self.table, sampler)
+            return self._drawn[1]
 
     def energy(self, scales: Scales) -> Energy | None:
         """Return the factor E, or None if it is one for all directions and wavelengths.

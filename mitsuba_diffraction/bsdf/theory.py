@@ -22,8 +22,7 @@ from .coat import SAME_INDEX
 from .energy import Coordinates, Energy
 from .fresnel import Material
 from .geometry import Geometry, Incidence, Interface, rotated
-from .order_sampler import MAX_INDEX_CHANGE
-from .orders import OrderSpectrum
+from .order_sampler import MAX_INDEX_CHANGE, OrderSampler
 from .parameters import GratingRequest, Media, check_parameters, check_transmission
 from .polarisation import Split, of_facets, of_orders
 from .rigorous_orders import RigorousOrders
@@ -183,8 +182,8 @@ class ScalarTheory(Theory):
         # The longest wavelength grows as the index falls.
         self.spectrum = self.spectrum.up_to(last / index)
         self.tables = SharedTables.of(self.spectrum, self.media.eta)
-        self.scattering, scales = self.tables.scattering, self.scales
-        scales.check(self.spectrum.wavelengths, shortest, getattr(self.scattering, "max_scale", None))
+        scales = self.scales
+        scales.check(self.spectrum.wavelengths, shortest, self.tables.max_scale)
         self.energy: Energy | None = None
         if self.conserve_energy and self.shadowing:
             self.energy = self.tables.energy(scales)
@@ -195,15 +194,14 @@ class ScalarTheory(Theory):
     def _interface(self) -> Interface:
         """Return the media above and below, and set the sampler of orders for the current scales and index."""
         coat, eta, is_sheet = self.media.coat, self.media.eta, self.media.transmission == "sheet"
-        sampler = self.tables.order_sampler(self.scales, is_sheet, 1.0 if coat is None else coat.relative)
-        scattering = self.tables.scattering
-        if sampler is not None and isinstance(scattering, OrderSpectrum):
-            self.scattering = scattering.with_order_sampler(sampler)
+        scattering = self.tables.scattering(self.scales, is_sheet, 1.0 if coat is None else coat.relative)
+        self.scattering = scattering
         if eta is None:
             return Interface(1.0 if coat is None else coat.eta)
         kappas = tuple(opaque(kappa) for kappa in small_kappas(self.spectrum, eta))
-        fraction = None if sampler is None else sampler.transmitted_fraction
-        return Interface(1.0, self.material.eta, is_sheet, kappas, fraction)
+        sampler = scattering.sampler
+        fraction = sampler.transmitted_fraction if isinstance(sampler, OrderSampler) else None
+        return Interface(1.0, self.material.eta, is_sheet, False, kappas, fraction)
 
     def parameters_changed(self, keys: list[str]) -> None:
         changed = [scale for scale in self.scales if not keys or scale.name in keys]
@@ -283,11 +281,12 @@ class RigorousTheory(Theory):
             raise RequestError(f"ext_ior: got {media.outside:g} with theory=rigorous, wanted air or a coat")
         check_transmission(spectrum.transmission, media)
         self.material = check_parameters(props, spectrum, coat)
-        self.scattering = cast(RigorousOrders, SharedTables.of(spectrum).scattering)
+        self.scattering = cast(RigorousOrders, SharedTables.of(spectrum).table)
         if media.eta is None:
             self.interface = Interface(1.0 if coat is None else coat.eta)
         else:
-            self.interface = Interface(eta=opaque(spectrum.int_ior.real), is_sheet=media.transmission == "sheet")
+            index, is_sheet = opaque(spectrum.int_ior.real), media.transmission == "sheet"
+            self.interface = Interface(1.0, index, is_sheet, rigorous=True)
         index = 1.0 if coat is None else media.index
         shortest, longest = spectrum.wavelengths
         self.wavelengths = shortest * index, longest * index

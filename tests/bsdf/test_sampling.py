@@ -25,7 +25,6 @@ from mitsuba_diffraction import testing
 from mitsuba_diffraction.bsdf.continuum_sampler import BinSampler
 from mitsuba_diffraction.bsdf.geometry import Incidence, Interface
 from mitsuba_diffraction.bsdf.order_sampler import OrderSampler
-from mitsuba_diffraction.bsdf.orders import OrderSpectrum
 
 SKINS = "elaphe", "xenopeltis"  # slow to build
 BUNDLED = {
@@ -341,8 +340,8 @@ def test_no_wavelength_is_sampled_outside_of_its_lobe(llvm, theta):
     # Regression: lobes were drawn whole and evaluated truncated. What a short wavelength drew outside its lobe of the
     # mirror order counted for longer ones: 800 nm reflected 5.8 % too much.
     spectrum = md.precompute(md.gratings.sinusoidal(2.5, 0.02), coherence_length=16.0, tolerance=0.1)
-    assert OrderSpectrum(spectrum).q_sampler is None
     bsdf = plugin(spectrum, conserve_energy=False)
+    assert bsdf.layers.grating.theory.scattering.resolved
     wi, wavelengths = direction(theta, 20), (400.0, 410.0, 420.0, 800.0)
     _, weight = draw(bsdf, wi, 1 << 18, wavelengths=wavelengths)
     wanted = albedo(bsdf, wi, side=1024, wavelengths=wavelengths)
@@ -351,9 +350,9 @@ def test_no_wavelength_is_sampled_outside_of_its_lobe(llvm, theta):
 
 
 def test_orders_are_drawn_where_their_lobes_are_narrow_and_apart(llvm):
-    assert isinstance(OrderSpectrum(md.precompute(SMALL["elaphe"](), coherence_length=26.0)).q_sampler, BinSampler)
-    assert isinstance(OrderSpectrum(blurred("blazed")).q_sampler, BinSampler)
-    assert OrderSpectrum(bundled("blazed")).q_sampler is None
+    elaphe = md.precompute(SMALL["elaphe"](), coherence_length=26.0)
+    for of, sampler in ((elaphe, BinSampler), (blurred("blazed"), BinSampler), (bundled("blazed"), OrderSampler)):
+        assert isinstance(plugin(of).layers.grating.theory.scattering.sampler, sampler)
 
 
 def test_a_mirror_with_wide_lobes_is_sampled(llvm):

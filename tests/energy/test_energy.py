@@ -289,7 +289,7 @@ def test_instances_of_one_surface_share_their_tables(tmp_path, monkeypatch):
     for held in (
         lambda theory: theory.tables,
         lambda theory: theory.energy,
-        lambda theory: theory.scattering.order_sampler,
+        lambda theory: theory.scattering.sampler,
     ):
         assert len({id(held(theory)) for theory in theories}) == 1
     profile = {"type": "diffraction_grating", "profile": "blazed", "period": 2.5, "depth": 0.123}
