@@ -50,7 +50,8 @@ def test_a_spectrum_for_shorter_wavelengths_holds_for_longer_ones(llvm, coat):
 
 def test_a_lower_index_is_not_black(llvm):
     # Regression: lowered from 2.4 to 1.5, nothing was transmitted above 530 nm.
-    lowered, wanted = (mi.load_dict({**GRATING, "transmission": "interface", "int_ior": n}) for n in (2.4, 1.5))
+    grating = {**GRATING, "transmission": "interface", "conserve_energy": False}
+    lowered, wanted = (mi.load_dict({**grating, "int_ior": n}) for n in (2.4, 1.5))
     parameters = mi.traverse(lowered)
     parameters["eta"] = 1.5
     parameters.update()

@@ -151,7 +151,7 @@ def test_transmission_is_reciprocal(kind, profile):
 
 def test_a_sheet_is_reciprocal_where_facets_are_grazed():
     # Regression: 1 − F of light that facets nearly reflect totally had other rounding errors in the reversed pair.
-    bsdf = transmitting("sheet", "sinusoidal", int_ior=2.4, coherence_length=2.0)
+    bsdf = transmitting("sheet", "sinusoidal", int_ior=2.4, coherence_length=2.0, conserve_energy=False)
     rng = np.random.default_rng(3)
     wi, wo = (random_directions(rng, 1 << 15, 0.02) * [1, 1, side] for side in (1, -1))
     there, back = (testing.evaluate(bsdf, i, o, [500.0])[:, 0] / abs(o[:, 2]) for i, o in ((wi, wo), (wo, wi)))
