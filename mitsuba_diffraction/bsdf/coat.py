@@ -3,16 +3,14 @@
 A plane layer of index n preserves the tangential components of wave vectors, and with them q = −(ω_i + ω_o)_∥/λ.
 Inside, sin θ' = sin θ/n and the wavelength is λ/n, hence κ' = 2πn (cos θ'_i + cos θ'_o)/λ and
 
-    f = T_i T_o R' K' G' E' S(q; κ')/λ²,    T = (1 − F(θ)) e^{−σd/cos θ'}
+    f = T_i T_o R' K' G' E' S(q; κ')/λ²,    T = 1 − F(θ)
 
-where F is the power reflectance of the front face, R' the reflectance of the material relative to n, σ the absorption
-and d the thickness; primed quantities are those inside. The front face also reflects F specularly. Light that the
-grating diffracts beyond the critical angle, or that the front face reflects back to the grating, is lost.
+where F is the power reflectance of the front face and R' the reflectance of the material relative to n; primed
+quantities are those inside. The front face also reflects F specularly. Light that the grating diffracts beyond the
+critical angle, or that the front face reflects back to the grating, is lost.
 """
 
 from __future__ import annotations
-
-import logging
 
 import drjit as dr
 import mitsuba as mi
@@ -24,32 +22,18 @@ from .tables import opaque
 
 MIN_INDEX, MAX_INDEX = 0.01, 100.0
 SAME_INDEX = 1e-3  # indices of refraction that differ by less, as those of air and vacuum, are taken as equal
-_log = logging.getLogger(__name__)
 
 
 def coat_from(props: mi.Properties) -> Coat | None:
-    """Return the layer given by `coat_ior`, `coat_absorption` and `coat_thickness`, or None.
-
-    A layer that has the index of the outside and does not absorb is ignored.
+    """Return the layer given by `coat_ior`, or None, also for one that has the index of the outside.
 
     Raises:
-        RequestError: if its index is below one or below that of the outside, or a parameter is out of range.
+        RequestError: if its index is below one or below that of the outside.
     """
-    given = {name: props[name] for name in ("coat_absorption", "coat_thickness") if name in props}
     if "coat_ior" not in props:
-        if given:
-            raise RequestError("coat_absorption, coat_thickness: got a layer without coat_ior, wanted its index, too")
         return None
-    for name, value in given.items():
-        if not (is_number(value) and 0 <= value < np.inf):
-            raise RequestError(f"{name}: got {value!r}, wanted a number ≥ 0")
-    if len(given) == 1:
-        _log.warning(
-            "diffraction_grating: %s changes nothing: absorption needs coat_absorption and coat_thickness", *given
-        )
-    depth = given.get("coat_absorption", 0.0) * given.get("coat_thickness", 0.0)
-    coat = Coat(props["coat_ior"], props.get("ext_ior", "air"), depth)
-    return None if coat.relative < 1 + SAME_INDEX and not coat.absorbs else coat
+    coat = Coat(props["coat_ior"], props.get("ext_ior", "air"))
+    return None if coat.relative < 1 + SAME_INDEX else coat
 
 
 def absolute_index(name: str, index: float | str) -> float:
@@ -79,17 +63,15 @@ class Coat:
     Attributes:
         index: n, absolute.
         relative, eta: n relative to the outside, as a number and as an array.
-        depth: σd, the optical depth at normal incidence.
     """
 
-    def __init__(self, index: float | str, outside: float | str, depth: float) -> None:
+    def __init__(self, index: float | str, outside: float | str) -> None:
         self.index = absolute_index("coat_ior", index)
         outer = absolute_index("ext_ior", outside)
         if self.index < max(1, (1 - SAME_INDEX) * outer):
             raise RequestError(f"coat_ior: got {self.index:g}, wanted at least one and that of the outside, {outer:g}")
         self.relative = max(self.index / outer, 1.0)
-        self.eta, self.depth = opaque(self.relative), opaque(depth)
-        self.absorbs = depth > 0
+        self.eta = opaque(self.relative)
 
     def cos_inside(self, cos: mi.Float) -> mi.Float:
         """Return cos θ' for the cosine of an angle outside."""
@@ -99,18 +81,10 @@ class Coat:
         """Return F at the cosine of an angle outside."""
         return mi.fresnel(cos, self.eta)[0]
 
-    def absorption(self, cos_inside: mi.Float) -> mi.Float:
-        """Return e^{−σd/cos θ'}."""
-        return dr.exp(-self.depth / dr.maximum(cos_inside, 1e-7)) if self.absorbs else mi.Float(1.0)
-
-    def transmittance(self, cos: mi.Float, cos_inside: mi.Float) -> mi.Float:
-        """Return T."""
-        return (1 - self.reflectance(cos)) * self.absorption(cos_inside)
-
     def sampling_probability(self, cos: mi.Float, albedo: mi.Float) -> mi.Float:
         """Return the probability of sampling the front face, from the albedo of the layers below it."""
         front = self.reflectance(cos)
         return dr.detach(dr.clip(front / (front + dr.square(1 - front) * albedo), 0, 1))
 
     def __repr__(self) -> str:
-        return f"n = {self.index:g}" + (f", optical depth {self.depth}" if self.absorbs else "")
+        return f"n = {self.index:g}"

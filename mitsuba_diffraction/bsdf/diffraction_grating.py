@@ -81,8 +81,6 @@ PARAMETERS = (
         "index of a clear plane layer over the grating, as for int_ior; no layer if it equals that of the outside",
         "none",
     ),
-    Parameter("coat_absorption", "float", "absorption of the layer, 1/µm", "0"),
-    Parameter("coat_thickness", "float", "thickness of the layer, µm; it matters only with coat_absorption", "0"),
     Parameter(
         "transmission",
         "string",

@@ -255,10 +255,6 @@ class Grating:
             # Radiance scales with n².
             k_i, k_o = interface.wave_vector(si.wi), interface.wave_vector(wo)
             value *= dr.square(k_i.index / k_o.index)
-        inside = [interface.wave_vector(omega).inner() for omega in directions]
-        if self.coat is not None:
-            for refracted in inside:
-                value *= self.coat.absorption(refracted.z)
         if not mi.is_polarized:
             for omega in directions:
                 value *= self._face_transmittance(omega)
@@ -269,6 +265,7 @@ class Grating:
         eta, has_face = interface.eta, [omega.z < 0 for omega in directions]
         if self.coat is not None:
             eta, has_face = self.coat.eta, [mi.Bool(True)] * 2
+        inside = [interface.wave_vector(omega).inner() for omega in directions]
         return through_layer(split, eta, directions, inside, has_face, ctx.mode)
 
     def _face_transmittance(self, omega: mi.Vector3f) -> mi.Float:
@@ -293,9 +290,7 @@ class Grating:
     def transmittance(self, si: mi.SurfaceInteraction3f, cos: mi.Float, active: mi.Bool) -> mi.UnpolarizedSpectrum:
         """Return T of a plane, times that of the coat, at the cosine of an angle outside."""
         transmitted = self._powers(si, cos, active)[1]
-        if self.coat is None:
-            return transmitted
-        return self.coat.transmittance(cos, self.coat.cos_inside(cos)) * transmitted
+        return transmitted if self.coat is None else (1 - self.coat.reflectance(cos)) * transmitted
 
     def reflectance(self, si: mi.SurfaceInteraction3f, cos: mi.Float, active: mi.Bool) -> mi.UnpolarizedSpectrum:
         """Return R of a plane below the coat, at the cosine of an angle outside."""

@@ -139,8 +139,8 @@ class Layers:
         active &= cos > 0
         reflected = self.grating.reflectance(si, cos, active)
         if self.coat is not None:
-            front, transmitted = self.coat.reflectance(cos), self.coat.transmittance(cos, self.coat.cos_inside(cos))
-            reflected = front + dr.square(transmitted) * reflected
+            front = self.coat.reflectance(cos)
+            reflected = front + dr.square(1 - front) * reflected
         if self.base is not None:
             of_base = mi.unpolarized_spectrum(self.base.bsdf.eval_diffuse_reflectance(si, active))
             reflected += self.grating.transmittance(si, cos, active) * of_base

@@ -9,10 +9,9 @@ import mitsuba_diffraction as md
 
 BLAZE = {"type": "diffraction_grating", "profile": "blazed", "period": 2.5, "depth": 0.25}
 DIFFUSE = {"type": "diffuse", "reflectance": {"type": "rgb", "value": [0.1, 0.4, 0.2]}}
-COAT = {"coat_ior": 1.5, "coat_absorption": 0.1, "coat_thickness": 1.0}
 GRATINGS = {
     "line": lambda: {**BLAZE, "material": "Al"},
-    "coat": lambda: {**BLAZE, "material": "Al", **COAT},
+    "coat": lambda: {**BLAZE, "material": "Al", "coat_ior": 1.5},
     "crossed": lambda: of_spectrum(spectrum("corner"), material="Cu", fresnel="schlick"),
     "sample": lambda: of_spectrum(
         md.precompute(md.gratings.elaphe(8), extent="sample", coherence_length=1.5),

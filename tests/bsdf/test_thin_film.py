@@ -62,9 +62,7 @@ def spectrum():
 
 def load(**parameters):
     """The grating without E, which does not depend on the film."""
-    return mi.load_dict(
-        {"type": "diffraction_grating", "spectrum": spectrum(), "conserve_energy": False, **parameters}
-    )
+    return mi.load_dict({"type": "diffraction_grating", "spectrum": spectrum(), "conserve_energy": False, **parameters})
 
 
 def material_of(bsdf):
@@ -210,10 +208,9 @@ def test_the_plugin_reflects_as_a_plane_at_the_half_vector(llvm, mode):
 def test_a_relief_with_a_clear_film_reflects_and_transmits_all_light(llvm, mode, least, side):
     """Of a sheet, light that both faces reflect is lost; a film that absorbs leaves less."""
     ctx = mi.BSDFContext(mi.TransportMode.Importance)
-    albedos = [
-        draw(load(**MODES[mode], height_scale=0.1, conserve_energy=True, **film), direction(15, 20) * [1, 1, side], 100_000, ctx)[1].mean(1)
-        for film in ({}, ZNS, ABSORBING)
-    ]
+    wi = direction(15, 20) * [1, 1, side]
+    bsdfs = [load(**MODES[mode], height_scale=0.1, conserve_energy=True, **film) for film in ({}, ZNS, ABSORBING)]
+    albedos = [draw(bsdf, wi, 100_000, ctx)[1].mean(1) for bsdf in bsdfs]
     bare, clear, absorbing = albedos
     for albedo in (bare, clear):
         assert least < albedo.min() <= albedo.max() < 1.005
