@@ -257,8 +257,8 @@ def test_only_pixels_covered_by_gratings_are_compared(llvm, tmp_path):
     assert disc - 2 * np.pi * radius < pictures.surface.sum() < disc
 
 
-@pytest.mark.few(2)
-@pytest.mark.parametrize("pigment", [False, True])
+@pytest.mark.few(1)
+@pytest.mark.parametrize("pigment", [True, False])
 def test_brightness_is_fitted_to_the_diffraction_of_this_model(llvm, tmp_path, pigment):
     pictures = Pictures(write(tmp_path / "scene.xml"), "gem", width=8, pigment=pigment)
     assert pictures.has_base == pigment

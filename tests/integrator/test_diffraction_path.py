@@ -214,7 +214,7 @@ def assert_agree(built, depth, spp, **parameters):
         pytest.param(partial(window, "sheet", -1), 3, 1024, id="flat face first"),
         pytest.param(films_between_lamps, 5, 2048, marks=pytest.mark.slow, id="films"),
         pytest.param(partial(films_between_lamps, "interface"), 5, 2048, marks=pytest.mark.slow, id="glass"),
-        pytest.param(taylor_terms, 3, 1024),
+        pytest.param(taylor_terms, 3, 1024, marks=pytest.mark.slow),
         pytest.param(sun_and_sky, 4, 1024, marks=pytest.mark.slow),
         pytest.param(lamp_and_spot, 5, 2048, marks=pytest.mark.slow),
         pytest.param(blend_under_a_point, -1, 1024, marks=pytest.mark.slow),
@@ -299,7 +299,9 @@ def image_of_a_wall(bsdf, coherence_length=1.5, x=0, tilt=90):
     ("build", "depth", "spp", "ratio"),
     [
         pytest.param(two_gratings, 6, 32, 1.4),
-        pytest.param(partial(image_of_a_wall, {"type": "plastic"}), 4, 256, 2, id="plastic wall"),
+        pytest.param(
+            partial(image_of_a_wall, {"type": "plastic"}), 4, 256, 2, id="plastic wall", marks=pytest.mark.slow
+        ),
         # Mitsuba offsets the origins of rays by 1e-4 of the coordinates.
         pytest.param(
             partial(image_of_a_wall, diffuse(0.8), x=100, tilt=60),
@@ -424,7 +426,7 @@ def test_gradients_are_finite_differences(llvm, mode):
     def brightness(reflectance):
         params["wall.bsdf.reflectance.value"] = reflectance
         params.update()
-        return dr.mean(mi.render(built, params, integrator=integrator, seed=7, spp=1024), axis=None)
+        return dr.mean(mi.render(built, params, integrator=integrator, seed=7, spp=256), axis=None)
 
     # Light scattered twice by the wall exceeds max_depth, so that the brightness is a linear function.
     finite = (brightness(mi.Float(0.9)) - brightness(mi.Float(0.7))) / 0.2
