@@ -281,11 +281,12 @@ def plot_maps(rows: Iterable[Row]) -> Figure:
         pictures = {f"{one.name}, published": one.pixels.colours}
         for method, linear in one.maps.items():
             found = agreement(one.pixels, linear)
-            pictures[f"{_TITLES[method]}: {found.correlation:.3f}"] = encoded(linear, found.brightness)
+            pictures[f"{_TITLES[method]}: r = {found.correlation:.3f}"] = encoded(linear, found.brightness)
         for (title, colours), panel in zip(pictures.items(), panels, strict=True):
             panel.imshow(one.pixels.picture(colours), interpolation="nearest")
             panel.set_title(title, fontsize=11)
             panel.set_axis_off()
+    drawn.supxlabel("r: correlation of the colours with those of the published map, outside of the mirror direction")
     return drawn
 
 
