@@ -12,7 +12,7 @@ const shapeOf = (data) => (data.shape === "coil" && !data.coil ? "sphere" : data
 function firstView(data) {
   if (shapeOf(data) === "coil") {
     return { azimuth: -60, elevation: 38, distance: 4.6, lightAzimuth: -20, lightElevation: 40,
-      lightWidth: 8, lightLength: 0, sky: 0.05, hasBase: data.material.material === "", pigment: "#20160c" };
+      lightWidth: 8, lightLength: 0, sky: 0.05, hasBase: data.material.material === "", pigment: "#100c0a" };
   }
   const isDielectric = data.material.material === "";
   const lines = data.spectrum.max_order.includes(0);
