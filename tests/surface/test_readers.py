@@ -749,6 +749,6 @@ def test_changed_bytes_give_heights_or_one_line(tmp_path_factory, name, data):
     try:
         message = ""
         assert np.isfinite(read_height_field(path, 0.1, unit="um").heights).all()
-    except ValueError as error:
+    except (ValueError, UserWarning) as error:  # a warning of heights that cannot be right
         message = str(error)
     assert not message or (name in message and "\n" not in message)
