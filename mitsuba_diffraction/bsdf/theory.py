@@ -201,7 +201,7 @@ class ScalarTheory(Theory):
         kappas = tuple(opaque(kappa) for kappa in small_kappas(self.spectrum, eta))
         sampler = scattering.sampler
         fraction = sampler.transmitted_fraction if isinstance(sampler, OrderSampler) else None
-        return Interface(1.0, self.material.eta, is_sheet, False, kappas, fraction)
+        return Interface(1.0, self.material.eta, is_sheet, kappas=kappas, transmitted_fraction=fraction)
 
     def parameters_changed(self, keys: list[str]) -> None:
         changed = [scale for scale in self.scales if not keys or scale.name in keys]
