@@ -48,7 +48,7 @@ def _switch(change: Callable[[], None]) -> None:
     """Count the time since the last call for the innermost stage; then `change` the stages."""
     global _since
     with _lock:
-        now = time.monotonic()
+        now = time.perf_counter()
         if _stages:
             _durations[_stages[-1]] = _durations.get(_stages[-1], 0.0) + now - _since
         _since = now
@@ -72,9 +72,9 @@ def stage(name: str) -> Iterator[None]:
 def durations() -> Iterator[None]:
     """Print at the end of a command that took more than ten seconds how long its stages took."""
     _durations.clear()
-    start = time.monotonic()
+    start = time.perf_counter()
     yield
-    if (total := time.monotonic() - start) > _MIN_REPORTED_DURATION:
+    if (total := time.perf_counter() - start) > _MIN_REPORTED_DURATION:
         parts = {**_durations, "other": total - sum(_durations.values())}
         text = ", ".join(f"{name} {seconds:.1f}" for name, seconds in parts.items() if seconds >= 0.05)
         tell(f"took {total:.1f} s: {text}")
