@@ -2,8 +2,8 @@
 
 Three rules: an input is never overwritten; a file with the mark may be; any other file needs `--overwrite`.
 
-All files that the package writes carry `MARK`: OpenEXR in the header, PNG in text chunks, PDF, SVG and WebP in their
-metadata, JSON as an entry, Markdown and CSV as a comment.
+All files that the package writes carry `MARK`: OpenEXR in the header, PNG in text chunks, JPEG, Markdown and CSV in a
+comment, PDF, SVG and WebP in their metadata, JSON as an entry.
 """
 
 from __future__ import annotations

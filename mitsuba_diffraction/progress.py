@@ -122,9 +122,11 @@ def _count(done: float, total: int, unit: str) -> str:
 
 
 def log_lines(
-    label: str, unit: str = "", seconds: float = 30.0, first: float = _MIN_REPORTED_SECONDS
+    label: str, unit: str = "", begin: str = "", seconds: float = 30.0, first: float = _MIN_REPORTED_SECONDS
 ) -> Callable[..., None]:
-    """Report progress without a terminal: a line on stderr after `first` seconds, then every `seconds`."""
+    """Report progress without a terminal: the message `begin`, a line after `first` seconds, then every `seconds`."""
+    if begin:
+        say(label, begin)
     start, depth = time.monotonic(), len(_stages)
     due = start + first
 
@@ -153,7 +155,7 @@ def progress_bar(label: str, unit: str = "", begin: str = "") -> Iterator[Callab
             yield shown
         return
     if not err.is_terminal:
-        yield log_lines(label, unit)
+        yield log_lines(label, unit, begin)
         return
     with _lock:
         if outermost := not _bars:

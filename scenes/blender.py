@@ -8,11 +8,16 @@ from __future__ import annotations
 
 import importlib
 import math
+import os
+import subprocess
 import sys
+import traceback
 from pathlib import Path
+from typing import NoReturn
 
 import bpy
 import mitsuba
+from mathutils import Vector
 
 SEGMENTS = 128  # of the ring
 
@@ -53,31 +58,39 @@ def degrees(*angles: float) -> tuple[float, ...]:
 def objects() -> None:
     """Add all objects with their materials."""
     ring(0.15, 0.6)
-    bpy.context.object.location, bpy.context.object.rotation_euler = (-1.15, 0, 0.56), degrees(65, 0, 25)
+    bpy.context.object.location, bpy.context.object.rotation_euler = (-1.25, 0.1, 0.62), degrees(65, 0, 25)
     material("Disc", (0.8, 0.8, 0.8), 0.5)
-    bpy.ops.mesh.primitive_monkey_add(size=1.2, location=(0.35, 0.3, 0.62), rotation=degrees(-15, 0, 15))
+    bpy.ops.mesh.primitive_monkey_add(size=1.5, location=(0, 0.1, 0.7), rotation=degrees(-20, 0, 12))
     bpy.ops.object.modifier_add(type="SUBSURF")
-    bpy.context.object.modifiers[-1].levels = 2
+    bpy.context.object.modifiers[-1].levels = 3
     bpy.ops.object.shade_smooth()
-    material("Skin", (0.35, 0.08, 0.02), 0.5)
-    bpy.ops.mesh.primitive_plane_add(size=1.1, location=(1.35, 0, 0.58), rotation=degrees(80, 0, -25))
+    material("Skin", (0.012, 0.009, 0.008), 0.5)
+    bpy.ops.mesh.primitive_plane_add(size=1.2, location=(1.35, 0, 0.64), rotation=degrees(85, 0, -20))
     material("Glass", (1, 1, 1), 0.0, Transmission_Weight=1.0)
-    bpy.ops.mesh.primitive_plane_add(size=0.8, location=(-0.2, -0.95, 0.02), rotation=degrees(6, 0, 10))
+    bpy.ops.mesh.primitive_plane_add(size=0.7, location=(0.1, -0.85, 0.03), rotation=degrees(6, 0, 10))
     material("Foil", (0.8, 0.8, 0.8), 0.2, Metallic=1.0)
-    bpy.ops.mesh.primitive_plane_add(size=12)
-    material("Floor", (0.35, 0.33, 0.3), 0.6)
+    bpy.ops.mesh.primitive_plane_add(size=40)
+    material("Floor", (0.03, 0.03, 0.034), 0.6)
 
 
 def lights() -> None:
-    """Add the lights and the world."""
-    bpy.ops.object.light_add(type="AREA", location=(-1.5, -3, 4), rotation=degrees(38, 0, -25))
-    lamp = bpy.context.object.data
-    lamp.shape, lamp.size, lamp.energy = "DISK", 0.3, 500
-    bpy.ops.object.light_add(type="SUN", rotation=degrees(50, 0, 150))
-    bpy.context.object.data.energy = 1.5
+    """Add the lights and the world; the small lamp stands behind the pane."""
+    for location, watts in (((-1.5, -3, 4), 900), ((2.2, 2.2, 3), 900)):
+        lamp(location, (0, 0, 0.6), 0.25, watts)
+    lamp((1.95, 1.6, 0.5), (0, -4.2, 1.6), 0.12, 3)
+    bpy.ops.object.light_add(type="SUN", rotation=degrees(55, 0, 155))
+    bpy.context.object.data.energy = 4
     world = bpy.context.scene.world = bpy.data.worlds.new("Sky")
     world.use_nodes = True
-    world.node_tree.nodes["Background"].inputs["Color"].default_value = (0.03, 0.036, 0.048, 1)
+    world.node_tree.nodes["Background"].inputs["Color"].default_value = (0.015, 0.018, 0.024, 1)
+
+
+def lamp(location: tuple[float, ...], target: tuple[float, ...], size: float, watts: float) -> None:
+    """Add a round area light that faces the target."""
+    rotation = (Vector(target) - Vector(location)).to_track_quat("-Z", "Y").to_euler()
+    bpy.ops.object.light_add(type="AREA", location=location, rotation=rotation)
+    added = bpy.context.object.data
+    added.shape, added.size, added.energy = "DISK", size, watts
 
 
 def main(addon: str, output: str) -> None:
@@ -89,13 +102,34 @@ def main(addon: str, output: str) -> None:
         bpy.data.objects.remove(old)
     objects()
     lights()
-    bpy.ops.object.camera_add(location=(0, -4.6, 2.1), rotation=degrees(70, 0, 0))
+    bpy.ops.object.camera_add(location=(0, -4.2, 1.9), rotation=degrees(71, 0, 0))
     scene = bpy.context.scene
-    scene.camera, bpy.context.object.data.lens = bpy.context.object, 38
-    scene.render.resolution_x, scene.render.resolution_y = 480, 270
-    scene.cycles.max_bounces, scene.cycles.samples = 4, 64
+    scene.camera, bpy.context.object.data.lens = bpy.context.object, 39
+    scene.render.resolution_x, scene.render.resolution_y = 960, 540
+    scene.cycles.max_bounces = 4
     bpy.ops.export_scene.mitsuba(filepath=str(Path(output).resolve()))
+    blender, renderer = bpy.app.version_string, mitsuba.__version__
+    print(f"Blender {blender}, Mitsuba-Blender {version_of(addon)}, Mitsuba {renderer}: {output}")
+
+
+def version_of(addon: str) -> str:
+    """Return the last numbered release of the add-on and the commits since."""
+    describe = ["git", "-C", addon, "describe", "--tags", "--match", "v*"]
+    return subprocess.run(describe, capture_output=True, text=True, check=True).stdout.strip()
+
+
+def run(*arguments: str) -> NoReturn:
+    """Run `main` and end the process, without the exit handlers of Blender and Mitsuba: together they do not return."""
+    code = 0
+    try:
+        main(*arguments)
+    except Exception:
+        traceback.print_exc()
+        code = 1
+    sys.stdout.flush()
+    sys.stderr.flush()
+    os._exit(code)
 
 
 if __name__ == "__main__":
-    main(*sys.argv[1:])
+    run(*sys.argv[1:])

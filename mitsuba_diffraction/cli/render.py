@@ -33,7 +33,10 @@ class Stopped(Exception):
 def render(
     scene: Annotated[Path, typer.Argument(metavar="SCENE.xml")],
     output: Annotated[
-        Path | None, typer.Option("-o", "--output", help="spectral picture; default: ./SCENE.exr")
+        Path | None,
+        typer.Option(
+            "-o", "--output", help="spectral picture (.exr), or the preview alone (.png, .jpg); default: ./SCENE.exr"
+        ),
     ] = None,
     spp: Annotated[
         int | None,
@@ -93,14 +96,12 @@ def render(
     orbit: Annotated[bool, typer.Option("--orbit", help="render pictures of one orbit around the scene")] = False,
     overwrite: Overwrite = False,
 ) -> None:
-    """Path-trace a scene into a spectral picture (.exr) with a preview (.png)."""
+    """Path-trace a scene into a spectral picture (.exr) with a preview (.png), or into a picture alone (.png, .jpg)."""
     from ..color import neutral_view, ocio_view
 
     # Before Mitsuba, which takes more than a second to start.
-    if output is not None:
-        check_suffix("-o", output, ".exr")
-    if rgb and channels is not None:
-        raise RequestError("--rgb writes no wavelengths: wanted --rgb or --channels N")
+    stored = {"half": False if single else None, "rgb": rgb, "channels": channels}
+    _check_output(output, stored)
     shown = neutral_view if view is None else ocio_view(view)
     if (frames is not None) != orbit:
         raise RequestError("--frames N and --orbit go together")
@@ -130,22 +131,24 @@ def render(
     spp = spp or named or 64
     tracer = trace_locally if dask is None else trace_on(dask)
     motions = [None] if frames is None else motions_of_orbit(scene, frames, **where)
+    alpha = has_alpha(scene, where["parameters"])
+    if alpha and target.suffix.lower() == ".jpg":
+        raise RequestError(f"-o: got {target}, but the scene has alpha, which JPEG has not; wanted .exr or .png")
     where |= {"width": width, "height": height}
     request: dict[str, Any] = {"spp": spp, "seed": seed, "until_error": until_error}
     request |= {"seconds": checkpoint, "tracer": tracer}
     if until_error is None:  # else nobody knows the time
-        planes = 3 + has_alpha(scene, where["parameters"])
-        written = 0 if rgb else channels
-        request["announce"] = partial(_announce, scene.name, 4 if single and not rgb else 2, planes, written, named)
+        written = channels if _is_spectral(target) and not rgb else 0
+        size = 1 if not _is_spectral(target) else 4 if single and not rgb else 2
+        request["announce"] = partial(_announce, scene.name, size, 3 + alpha, written, named)
     pictures = _pictures(target, frames)
-    stored = {"half": False if single else None, "rgb": rgb, "channels": channels}
     factor = None if exposure is None else 2**exposure
     options = {"resume": resume, "stored": stored, "denoise": denoise, "view": shown}
     with durations():
         _render(scene, pictures, motions, where, request, factor, **options)
         if frames is not None:
             animation = target.with_suffix(".webp")
-            save_animation([path.with_suffix(".png") for path in pictures], animation)
+            save_animation([_preview(path) for path in pictures], animation)
             tell(f"{animation}: animated preview, {frames} frames")
 
 
@@ -214,8 +217,31 @@ def _requests_denoising(scene: Path) -> bool:
     return True
 
 
+def _check_output(output: Path | None, stored: dict[str, Any]) -> None:
+    """Check the name of the picture, and whether the options of an EXR (`stored`) go with it and with each other."""
+    if stored["rgb"] and stored["channels"] is not None:
+        raise RequestError("--rgb writes no wavelengths: wanted --rgb or --channels N")
+    if output is None:
+        return
+    check_suffix("-o", output, ".exr", ".png", ".jpg")
+    options = {"--float": stored["half"] is False, "--rgb": stored["rgb"], "--channels": stored["channels"] is not None}
+    if not _is_spectral(output) and any(options.values()):
+        named = ", ".join(option for option, given in options.items() if given)
+        raise RequestError(f"{named}: how an .exr is stored; got {output}, a picture of eight bits")
+
+
+def _is_spectral(path: Path) -> bool:
+    """Return whether a picture is to be stored spectrally; if not, its preview is all that is written."""
+    return path.suffix.lower() == ".exr"
+
+
+def _preview(path: Path) -> Path:
+    """Return the path of the preview of a picture: next to it, or the picture itself."""
+    return path.with_suffix(".png") if _is_spectral(path) else path
+
+
 def _pictures(target: Path, frames: int | None) -> list[Path]:
-    """Return the paths of the spectral pictures: `target`, or those of its frames, `target_007.exr`."""
+    """Return the paths of the pictures: `target`, or those of its frames, `target_007.exr`."""
     if frames is None:
         return [target]
     digits = max(3, len(str(frames - 1)))
@@ -225,7 +251,8 @@ def _pictures(target: Path, frames: int | None) -> list[Path]:
 def _outputs(target: Path, frames: int | None) -> list[Path]:
     """Return all files that the command writes."""
     pictures = _pictures(target, frames)
-    return [*pictures, *(p.with_suffix(".png") for p in pictures), *([target.with_suffix(".webp")] if frames else [])]
+    animation = [target.with_suffix(".webp")] if frames else []
+    return [*pictures, *(_preview(path) for path in pictures if _is_spectral(path)), *animation]
 
 
 def _picture(
@@ -259,14 +286,22 @@ def _picture(
     from ..render.spectral_image import exposure_of_preview, save_preview, stored_digest
 
     start = time.perf_counter()
-    checkpoint, preview = checkpoint_path(path), path.with_suffix(".png")
+    checkpoint, preview = checkpoint_path(path), _preview(path)
     earlier = stored_digest(path) if resume and path.is_file() and not checkpoint.exists() else None
     if denoise:
         check_requirements()
     interrupted = False
     try:
         with progress_bar(label, "spp", "loading and compiling") as progress:
-            image = trace(scene, **where, **request, checkpoint=checkpoint, finished=earlier, progress=progress)
+            image = trace(
+                scene,
+                **where,
+                **request,
+                checkpoint=checkpoint,
+                finished=earlier,
+                progress=progress,
+                on_checkpoint=partial(save_preview, path=preview, exposure=exposure, view=view),
+            )
     except Finished:
         tell(f"{path}: complete, nothing to do")
         return exposure if exposure is not None else exposure_of_preview(preview)
@@ -279,34 +314,43 @@ def _picture(
             raise
         raise Stopped(f"{complete}; the same command with --resume continues") from None
     try:
-        with stage("writing"):
-            image.save(path, **stored)
+        if _is_spectral(path):
+            with stage("writing"):
+                image.save(path, **stored)
         with stage("preview"):
             clean = partial(denoised_picture, load_spectral_scene(scene, **where)) if denoise else None
             exposure = save_preview(image, preview, exposure, clean, view)
     except (OSError, RuntimeError) as error:
         kept = f"; {checkpoint} is kept, and --resume continues from it" if checkpoint.exists() else ""
-        raise RuntimeError(f"{path} or its preview cannot be written ({error}){kept}") from error
+        written = f"{path} or its preview" if _is_spectral(path) else str(path)
+        raise RuntimeError(f"{written} cannot be written ({error}){kept}") from error
     if interrupted:
         spp = image.attributes["spp"]
         raise Stopped(f"{path} holds {spp} samples per pixel; the same command with --resume continues")
     discard_checkpoints(checkpoint)
+    channels = _channels(image, **stored) if _is_spectral(path) else "8 bits"
+    exposed = f"exposed by {(stops := math.log2(exposure)):+.2f} stops (--exposure {stops:.2f})"
     tell(
-        f"{path}: {_summary(image, request['until_error'], stored)}, "
-        f"{time.perf_counter() - start:.1f} s, {path.stat().st_size / 1e6:.3g} MB\n"
-        f"{preview}: preview, exposed by {(stops := math.log2(exposure)):+.2f} stops (--exposure {stops:.2f})"
+        f"{path}: {_summary(image, request['until_error'], channels)}, "
+        f"{time.perf_counter() - start:.1f} s, {path.stat().st_size / 1e6:.3g} MB"
+        + (f"\n{preview}: preview, {exposed}" if _is_spectral(path) else f", {exposed}")
     )
     return exposure
 
 
-def _summary(image: SpectralImage, until_error: float | None, stored: dict[str, Any]) -> str:
-    """Return size, channels as `stored`, samples and noise of a picture."""
+def _channels(image: SpectralImage, *, half: bool | None, rgb: bool, channels: int | None) -> str:
+    """Return the channels of a picture as stored by `SpectralImage.save`."""
     from ..render.spectral_image import wider_hats
 
-    rows, columns, wavelengths = image.shape
-    if stored["channels"] is not None:
-        wavelengths = wider_hats(wavelengths, stored["channels"]).shape[1]
-    channels = "RGB" if stored["rgb"] else f"{wavelengths} wavelengths"
+    wavelengths = image.shape[2]
+    if channels is not None:
+        wavelengths = wider_hats(wavelengths, channels).shape[1]
+    return "RGB" if rgb else f"{wavelengths} wavelengths"
+
+
+def _summary(image: SpectralImage, until_error: float | None, channels: str) -> str:
+    """Return size, channels as stored, samples and noise of a picture."""
+    rows, columns, _ = image.shape
     text = f"{columns} × {rows} pixels, {channels}, {image.attributes['spp']} samples per pixel"
     if "error" in image.attributes:
         error = float(image.attributes["error"])

@@ -309,7 +309,8 @@ class BandedImage(SpectralImage):
             for rows in split_rows(*sums.luminance.shape):
                 yield sums.radiance(rows)
             del sums
-        self._sums.release()
+        if len(self._sums.bands) > 1:
+            self._sums.release()
 
     @cached_property
     def radiance(self) -> NDArray[np.float32]:
@@ -448,6 +449,7 @@ def render(
     tracer: Tracer = trace_locally,
     progress: Callable[[float, float, float], None] = lambda done, total, error: None,
     announce: Callable[[Estimate], None] = lambda estimate: None,
+    on_checkpoint: Callable[[SpectralImage], object] = lambda image: None,
 ) -> SpectralImage:
     """Render the first sensor of a scene spectrally, with its own integrator, in the current variant.
 
@@ -468,12 +470,15 @@ def render(
             maximum.
         checkpoint: file in which the sums are saved periodically. If it exists, rendering resumes from it. The caller
             removes it after saving the picture (`discard_checkpoints`). Large pictures have several.
-        seconds: interval between checkpoints, or twenty times the time that writing one takes, if that is longer.
+        seconds: interval between checkpoints, or twenty times the time that writing one takes (with `on_checkpoint`),
+            if that is longer.
         finished: the attribute `digest` of a picture of an earlier run.
         tracer: traces the passes; default: this process, see also `cluster.trace_on`.
         progress: called at the start and after each pass with the samples per pixel done, in total (with `until_error`,
             extrapolated from the current error), and the current error (NaN before four passes).
         announce: called once, after two passes (of the bands of a large picture: the first compiles).
+        on_checkpoint: called after each checkpoint, while rendering goes on, with the picture so far. To bound memory,
+            it is read from the sums block by block.
 
     Returns:
         The picture; radiance per nm at `channel_wavelengths` of the film's range. Its attributes are the scene, the
@@ -512,6 +517,7 @@ def render(
             tracer,
             progress,
             lambda remaining: announce(Estimate(columns, rows, channels, sum(job.samples), memory, disk, remaining)),
+            on_checkpoint,
         )
     if sums.done < len(job.bands):
         raise KeyboardInterrupt
@@ -531,6 +537,7 @@ def _trace(
     tracer: Tracer,
     progress: Callable[[float, float, float], None],
     announce: Callable[[float], None],
+    on_checkpoint: Callable[[SpectralImage], object],
 ) -> bool:
     """Add passes to the sums until the picture is complete or Ctrl-C was pressed; return whether it is complete."""
     first, total, started = sums.done, len(job.samples) * len(job.bands), 0.0
@@ -548,6 +555,9 @@ def _trace(
             if checkpoint is not None and due and not complete:
                 last_checkpoint = time.monotonic()
                 sums.save()
+                if not interrupted():
+                    with stage("preview"):
+                        on_checkpoint(BandedImage(sums, {}))
                 interval = max(seconds, MIN_CHECKPOINT_INTERVAL * (time.monotonic() - last_checkpoint))
     return complete
 

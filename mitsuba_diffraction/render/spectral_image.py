@@ -44,6 +44,7 @@ _RESERVED = frozenset(
 )
 
 
+_JPEG_QUALITY = 95
 _PIXELS_PER_BLOCK = 2**17
 
 
@@ -234,21 +235,34 @@ class SpectralImage:
 
 
 def stored_digest(path: str | os.PathLike[str]) -> str | None:
-    """Return the attribute `digest` of a picture that `SpectralImage.save` wrote, None if it has none or is damaged."""
+    """Return the attribute `digest` of a picture that `SpectralImage.save` or `save_preview` wrote.
+
+    None if it has none, as the preview of an unfinished rendering, or is damaged.
+    """
     import OpenEXR
 
+    if Path(path).suffix.lower() != ".exr":
+        return _notes(path).get("digest")
     with suppress(RuntimeError, ValueError), silence():
         return OpenEXR.File(os.fspath(path), header_only=True).header().get("digest")
     return None
 
 
 def exposure_of_preview(path: str | os.PathLike[str]) -> float | None:
-    """Return the exposure of a preview that `save_preview` wrote as PNG, None if it does not hold one."""
+    """Return the exposure of a preview that `save_preview` wrote, None if it does not hold one."""
+    with suppress(KeyError, ValueError):
+        return float(_notes(path)["exposure"])
+    return None
+
+
+def _notes(path: str | os.PathLike[str]) -> dict[str, str]:
+    """Return what `save_preview` noted in a picture: text chunks of PNG, lines NAME=VALUE of the comment of JPEG."""
     from PIL import Image
 
-    with suppress(OSError, KeyError, ValueError), Image.open(path) as picture:
-        return float(picture.info["exposure"])
-    return None
+    with suppress(OSError, ValueError), Image.open(path) as picture:
+        comment = picture.info.get("comment", b"").decode()
+        return {**picture.info, **dict(line.split("=") for line in comment.splitlines()[1:])}
+    return {}
 
 
 def save_preview(
@@ -258,7 +272,9 @@ def save_preview(
     denoise: Callable[[NDArray[np.float32]], NDArray[np.float32]] | None = None,
     view: View = neutral_view,
 ) -> float:
-    """Write an 8-bit sRGB preview of a spectral image, in the format given by the suffix of `path`.
+    """Write an 8-bit sRGB preview of a spectral image, in the format given by the suffix of `path`: PNG or JPEG.
+
+    It notes its exposure, and the digest of a finished rendering.
 
     Spectra → XYZ → linear sRGB → `into_gamut` → × exposure → view.
 
@@ -269,6 +285,7 @@ def save_preview(
 
     Raises:
         ValueError: if Pillow does not support the suffix.
+        OSError: of JPEG with alpha, or if it cannot be written.
     """
     from PIL import Image
 
@@ -285,8 +302,14 @@ def save_preview(
     shown = np.concatenate([on_screen(picture[rows] * exposure, view) for rows in blocks])
     if image.alpha is not None:
         shown = np.dstack([shown, np.round(255 * image.alpha).astype(np.uint8)])
+    notes = {"exposure": repr(exposure)}
+    if "digest" in image.attributes:
+        notes["digest"] = str(image.attributes["digest"])
     text = png_text()
-    text.add_text("exposure", repr(exposure))
+    for name, value in notes.items():
+        text.add_text(name, value)
+    comment = "\n".join([MARK, *(f"{name}={value}" for name, value in notes.items())])
     with whole_file(path) as temporary:
-        Image.fromarray(shown).save(temporary, pnginfo=text)
+        # Each format ignores the options of the other.
+        Image.fromarray(shown).save(temporary, pnginfo=text, comment=comment, quality=_JPEG_QUALITY, subsampling=0)
     return exposure

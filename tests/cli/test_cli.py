@@ -15,9 +15,10 @@ import mitsuba as mi
 import numpy as np
 import OpenEXR
 import pytest
+from PIL import Image
 
 import mitsuba_diffraction as md
-from mitsuba_diffraction.cli import _CtrlC
+from mitsuba_diffraction.cli import _CtrlC, main
 from mitsuba_diffraction.cli.arguments import scene_parameters
 from mitsuba_diffraction.errors import RequestError
 from mitsuba_diffraction.progress import log_lines
@@ -101,7 +102,9 @@ def files():
         ("precompute counts.npy --pixel-size 0.05", "height_range: missing"),
         ("render", "Missing argument"),
         ("render gone.xml", "gone.xml"),
-        ("render scene.xml -o out.png", "out.png"),
+        ("render scene.xml -o out.tiff", "out.tiff, wanted a file name that ends in .exr, .png or .jpg"),
+        ("render scene.xml -o out.png --rgb --float", "--float, --rgb: how an .exr is stored; got out.png"),
+        ("render scene.xml -o out.jpg --channels 9", "--channels: how an .exr is stored; got out.jpg"),
         ("render scene.xml -o nowhere/out.exr", "nowhere"),
         ("render scene.xml -D spectrum", "-D: got 'spectrum', wanted NAME=VALUE"),
         ("render scene.xml -D =blaze.toml", "-D: got '=blaze.toml'"),
@@ -490,6 +493,51 @@ def test_render_writes_a_spectral_picture_and_a_preview(command):
     assert channels["G"].pixels[4, 4] > 0
     assert out.startswith("out.exr: 8 × 8 pixels")
     assert "out.png" in files()
+
+
+def test_a_picture_alone_is_the_preview_of_the_spectral_one(command):
+    Path("scene.xml").write_text(SCENE)
+    line = "render scene.xml --spp 2 --width 8 --variant llvm_ad_spectral -D spectrum=blaze.toml --exposure 1"
+    before = files()
+    for name in ("out.exr", "a.png", "b.jpg"):
+        for _ in range(2):  # the second time over its own file
+            code, out, err = command(f"{line} -o {name}")
+            assert (code, err.strip()) == (0, "")
+    assert re.fullmatch(r"b\.jpg: 8 × 8 pixels, 8 bits, 2 samples per pixel, .*exposed by \+1\.00 stops .*\n", out)
+    assert files() - before == {"out.exr", "out.png", "a.png", "b.jpg"}
+    preview, png, jpeg = (np.array(Image.open(name)).astype(int) for name in ("out.png", "a.png", "b.jpg"))
+    np.testing.assert_array_equal(png, preview)
+    assert np.abs(jpeg - preview).max() < 20
+
+
+def test_a_picture_with_alpha_is_no_jpeg(command):
+    Path("scene.xml").write_text(
+        SCENE.replace("</film>", '<string name="pixel_format" value="rgba"/></film>').replace("$spectrum", "blaze.toml")
+    )
+    line = "render scene.xml --spp 2 --width 8 --variant llvm_ad_spectral"
+    before = files()
+    code, out, err = command(f"{line} -o a.JPG")
+    assert (code, out, files()) == (2, "", before)
+    assert err.strip().endswith("-o: got a.JPG, but the scene has alpha, which JPEG has not; wanted .exr or .png")
+    assert command(f"{line} -o a.png")[0] == 0
+    with Image.open("a.png") as picture:
+        assert picture.mode == "RGBA"
+
+
+def test_the_first_message_comes_before_the_scene_is_loaded(monkeypatch, capfd):
+    """A log was silent for as long as loading and compiling took."""
+
+    def interrupted(*arguments, **named):
+        raise KeyboardInterrupt
+
+    Path("scene.xml").write_text(SCENE)
+    monkeypatch.setattr(passes, "load_spectral_scene", interrupted)
+    monkeypatch.setattr(sys, "argv", ["mitsuba-diffraction", "render", "scene.xml"])
+    with pytest.raises(SystemExit):
+        main()
+    said = capfd.readouterr().err.splitlines()
+    assert said[0] == "mitsuba-diffraction: scene.xml: loading and compiling"
+    assert said[1:] == ["mitsuba-diffraction: interrupted: nothing was written"]
 
 
 def test_the_installed_command_ends_with_its_exit_code(folder):

@@ -96,6 +96,7 @@ def test_a_scene_names_files(folder):
     [
         (f"{RENDER} -o u.exr", "u.exr"),
         (f"{RENDER} -o tex.exr", "tex.png"),  # the preview
+        (f"{RENDER} -o tex.png", "tex.png"),
         (f"{RENDER} -o hard.exr", "u.exr"),
         (f"{RENDER} -o soft.exr", "u.exr"),
         (f"{RENDER} -o there/u.exr", "u.exr"),
@@ -177,7 +178,12 @@ def test_own_files_are_overwritten_and_foreign_files_only_with_the_option(comman
 
 
 @pytest.mark.parametrize(
-    ("line", "name"), [(f"{RENDER} -o a.exr", "a.png"), ("compare u.xml --json sky.spd -o b", "sky.spd")]
+    ("line", "name"),
+    [
+        (f"{RENDER} -o a.exr", "a.png"),
+        (f"{RENDER} -o a.png", "a.png"),
+        ("compare u.xml --json sky.spd -o b", "sky.spd"),
+    ],
 )
 def test_foreign_files_are_not_replaced(command, line, name):
     Path("a.png").write_text("a year's work")
@@ -211,7 +217,9 @@ def test_bad_input_leaves_own_files_as_they_are(command, line, name, text):
     assert contents() == before
 
 
-@pytest.mark.parametrize("name", ["a.json", "a.md", "a.csv", "a.png", "a.pdf", "a.svg", "a.webp", "a.exr", "u.exr"])
+@pytest.mark.parametrize(
+    "name", ["a.json", "a.md", "a.csv", "a.png", "a.jpg", "a.pdf", "a.svg", "a.webp", "a.exr", "u.exr"]
+)
 def test_every_format_carries_the_mark(name):
     if name == "a.json":
         outputs.save_json({"a": 1}, name)
@@ -226,10 +234,11 @@ def test_every_format_carries_the_mark(name):
         from mitsuba_diffraction.render.turntable import save_animation
 
         save_animation([Path("tex.png"), Path("scan.png")], name)
-    elif name == "a.exr":
-        from mitsuba_diffraction.render import SpectralImage
+    elif name in ("a.exr", "a.jpg"):
+        from mitsuba_diffraction.render.spectral_image import SpectralImage, save_preview
 
-        SpectralImage([500.0, 600.0], np.zeros((2, 2, 2), np.float32)).save(name)
+        image = SpectralImage([500.0, 600.0], np.zeros((2, 2, 2), np.float32))
+        image.save(name) if name == "a.exr" else save_preview(image, name)
     elif name != "u.exr":
         from matplotlib.figure import Figure
 

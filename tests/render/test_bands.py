@@ -12,6 +12,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 import pytest
+from PIL import Image
 
 import mitsuba_diffraction  # noqa: F401 (settles which LLVM is used before a variant is set)
 from mitsuba_diffraction.color import spectrum_to_XYZ
@@ -19,6 +20,7 @@ from mitsuba_diffraction.render import SpectralImage, film, passes, render
 from mitsuba_diffraction.render.film import LightOfBands, bands_of, trace_pass
 from mitsuba_diffraction.render.passes import BandedImage, Interrupted, trace_locally
 from mitsuba_diffraction.render.scene import channel_wavelengths, load_spectral_scene
+from mitsuba_diffraction.render.spectral_image import save_preview
 
 # A grating in the sun in front of a wall, and of a crop window of 12 × 10 pixels.
 SCENE = """<scene version="3.0.0">
@@ -206,6 +208,33 @@ def test_bands_are_interrupted_resumed_and_saved(integrator, three_bands, small_
     assert {path.name for path in Path().iterdir()} == {"scene.xml", "a.exr"}
 
 
+def test_previews_of_bands_hold_one_band_in_memory(three_bands, small_passes, monkeypatch):
+    small_passes(11)
+    monkeypatch.setattr(passes, "MIN_CHECKPOINT_INTERVAL", 0)
+    whole = render(write_scene(), spp=2)
+    rows, previews = [], []
+    radiance = passes.Accumulation.radiance
+
+    def of_rows(sums, *blocks):
+        rows.append(len(sums.luminance))
+        return radiance(sums, *blocks)
+
+    def look(image):
+        save_preview(image, "a.png")
+        assert "radiance" not in vars(image)  # read as a whole
+        previews.append(np.array(Image.open("a.png")))
+
+    with monkeypatch.context() as patch:
+        patch.setattr(passes.Accumulation, "radiance", of_rows)
+        resumed = render("scene.xml", spp=2, checkpoint="c", seconds=0, on_checkpoint=look)
+    np.testing.assert_array_equal(resumed.radiance, whole.radiance)
+    assert len(previews) == 5  # after all bands but the last
+    assert rows == 5 * [3, 3, 4]
+    # Bands that were not traced yet are black.
+    assert [preview[:3].any() for preview in previews] == 5 * [True]
+    assert [preview[6:].any() for preview in previews] == 2 * [False] + 3 * [True]
+
+
 def test_the_error_of_bands_is_that_of_the_whole_picture(three_bands, small_passes, monkeypatch):
     small_passes(11)
     banded = render(write_scene(), spp=64, until_error=0.2)
@@ -246,7 +275,7 @@ def test_large_pictures_need_at_most_two_gigabytes():
     # Started by a small process: Linux counts the memory of the process that starts another one as that of the latter.
     program = """
 import os, sys
-words = ("render", "scene.xml", "--width", "2560", "--spp", "1", "-o", "out.exr")
+words = ("render", "scene.xml", "--width", "2560", "--spp", "1", "--checkpoint", "0", "-o", "out.exr")
 process = os.posix_spawn(sys.executable, [sys.executable, "-m", "mitsuba_diffraction", *words], os.environ)
 _, status, usage = os.wait4(process, 0)
 print(status, usage.ru_maxrss)

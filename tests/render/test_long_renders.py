@@ -27,6 +27,7 @@ from mitsuba_diffraction.render.passes import (
     save_checkpoint,
 )
 from mitsuba_diffraction.render.scene import channel_wavelengths, load_spectral_scene, scene_digest
+from mitsuba_diffraction.render.spectral_image import save_preview, stored_digest
 from mitsuba_diffraction.render.turntable import orbit
 
 SIZE = 16
@@ -382,6 +383,51 @@ def test_the_command_is_interrupted_and_goes_on(command, monkeypatch):
     assert Path("out.exr").stat().st_mtime_ns == written
 
 
+@pytest.mark.parametrize("name", ["out.png", "out.jpg"])
+def test_a_picture_alone_is_interrupted_and_goes_on(command, monkeypatch, name):
+    line = f"{RENDER} -o {name} --spp 4"
+    press_ctrl_c(monkeypatch, 2)
+    code, out, err = command(line)
+    assert (code, out) == (130, "")
+    assert f"interrupted: {name} holds 2 samples per pixel; the same command with --resume continues" in err
+    assert files() == {"scene.xml", name, f"{name}.checkpoint"}
+    assert stored_digest(name) is None
+    assert f"{name}.checkpoint is of an unfinished rendering" in command(line)[2]
+    code, out, err = command(f"{line} --resume")
+    assert (code, err) == (0, "")
+    assert files() == {"scene.xml", name}
+    save_preview(render("scene.xml", spp=4), f"whole_{name}")
+    assert Path(f"whole_{name}").read_bytes() == Path(name).read_bytes()
+    # Done already: nothing is traced again.
+    monkeypatch.setattr(passes, "trace_pass", None)
+    written = Path(name).stat().st_mtime_ns
+    assert command(f"{line} --resume")[:2] == (0, f"{name}: complete, nothing to do\n")
+    assert Path(name).stat().st_mtime_ns == written
+
+
+@pytest.mark.parametrize("name", ["out.exr", "out.png"])
+def test_each_checkpoint_renews_the_preview(command, monkeypatch, name):
+    monkeypatch.setattr(passes, "MIN_CHECKPOINT_INTERVAL", 0)
+    original, seen = passes.trace_pass, []
+
+    def trace_pass(*arguments):
+        seen.append((files() - {".out.exr.checkpoint.lock", ".out.png.checkpoint.lock"}, preview_so_far()))
+        return original(*arguments)
+
+    def preview_so_far():
+        return np.array(Image.open("out.png")).astype(int) if Path("out.png").exists() else None
+
+    monkeypatch.setattr(passes, "trace_pass", trace_pass)
+    line = f"{RENDER} -o {name} --spp 3 --checkpoint 0 --exposure 0"
+    assert command(line)[0] == 0
+    assert [found for found, _ in seen] == [{"scene.xml"}, *2 * [{"scene.xml", "out.png", f"{name}.checkpoint"}]]
+    save_preview(render("scene.xml", spp=3), "whole.png", exposure=1)
+    whole = np.array(Image.open("whole.png")).astype(int)
+    np.testing.assert_array_equal(preview_so_far(), whole)
+    after_one, after_two = (np.abs(preview - whole).mean() for _, preview in seen[1:3])
+    assert 30 > after_one > after_two > 0
+
+
 def test_the_command_stops_at_an_error_and_reports_if_it_is_not_reached(command):
     code, out, err = command(f"{RENDER} -o out.exr --spp 4096 --until-error 0.2")
     assert (code, err) == (0, "")
@@ -477,7 +523,8 @@ def test_a_disk_that_the_picture_fills_is_one_line(command, small_disk, monkeypa
     assert "disk/out.exr.checkpoint: cannot be written (No space left on device)" in err
     assert len(err.splitlines()) == 1
     assert samples_in("disk/out.exr.checkpoint") == 1
-    Path("disk/out.exr.checkpoint").unlink()
+    for name in ("out.exr.checkpoint", "out.png"):
+        Path("disk", name).unlink()
     code, out, err = command(f"{RENDER} -o disk/out.exr --width 80 --spp 1")
     assert (code, out) == (1, "")
     assert len(err.splitlines()) == 1, err
@@ -592,6 +639,14 @@ def test_a_second_ctrl_c_in_a_turntable_reports_completed_pictures(command, monk
     assert code == 130
     assert "interrupted: 1 of 3 pictures are complete; the same command with --resume continues" in err
     assert files() == {"scene.xml", "out_000.exr", "out_000.png"}
+
+
+def test_a_turntable_of_pictures_alone(command):
+    line = f"{RENDER} -o out.jpg --frames 2 --orbit --spp 1"
+    assert command(line)[0] == 0
+    assert files() == {"scene.xml", "out.webp", "out_000.jpg", "out_001.jpg"}
+    code, out, _ = command(f"{line} --resume")
+    assert (code, out.count("complete, nothing to do")) == (0, 2)
 
 
 @pytest.mark.parametrize("options", ["--frames 3", "--orbit", "--frames 1 --orbit", "--frames 1000000 --orbit"])
