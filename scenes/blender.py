@@ -1,7 +1,8 @@
 """A scene of Blender, exported by Mitsuba-Blender: `python scenes/blender.py ADDON exported.xml`, for docs/blender.md.
 
-ADDON is a checkout of the add-on; `pip install bpy==4.5.15 mitsuba==3.5.0` in an environment of Python 3.11. A ring, a
-monkey, a pane, foil and a floor, unwrapped by Blender; an area light, a sun and a dim world. Lengths are metres.
+ADDON is a git checkout of the add-on, with tags; `pip install bpy==4.5.15 mitsuba==3.5.0`, or `bpy==5.0.1`, in an
+environment of Python 3.11. A ring, a monkey, a pane, foil and a floor, unwrapped by Blender; a sun, two area lights and a
+dim world; Blender's own number of samples. Lengths are metres.
 """
 
 from __future__ import annotations
@@ -17,7 +18,7 @@ from typing import NoReturn
 
 import bpy
 import mitsuba
-from mathutils import Vector
+from mathutils import Euler, Vector
 
 SEGMENTS = 128  # of the ring
 
@@ -58,39 +59,42 @@ def degrees(*angles: float) -> tuple[float, ...]:
 def objects() -> None:
     """Add all objects with their materials."""
     ring(0.15, 0.6)
-    bpy.context.object.location, bpy.context.object.rotation_euler = (-1.25, 0.1, 0.62), degrees(65, 0, 25)
+    bpy.context.object.location, bpy.context.object.rotation_euler = (-1.35, 0.1, 0.62), degrees(65, 0, 25)
     material("Disc", (0.8, 0.8, 0.8), 0.5)
     bpy.ops.mesh.primitive_monkey_add(size=1.5, location=(0, 0.1, 0.7), rotation=degrees(-20, 0, 12))
     bpy.ops.object.modifier_add(type="SUBSURF")
     bpy.context.object.modifiers[-1].levels = 3
     bpy.ops.object.shade_smooth()
     material("Skin", (0.012, 0.009, 0.008), 0.5)
-    bpy.ops.mesh.primitive_plane_add(size=1.2, location=(1.35, 0, 0.64), rotation=degrees(85, 0, -20))
+    bpy.ops.mesh.primitive_plane_add(size=1.2, location=(1.3, 0, 0.64), rotation=degrees(85, 0, -20))
     material("Glass", (1, 1, 1), 0.0, Transmission_Weight=1.0)
     bpy.ops.mesh.primitive_plane_add(size=0.7, location=(0.1, -0.85, 0.03), rotation=degrees(6, 0, 10))
     material("Foil", (0.8, 0.8, 0.8), 0.2, Metallic=1.0)
     bpy.ops.mesh.primitive_plane_add(size=40)
-    material("Floor", (0.03, 0.03, 0.034), 0.6)
+    material("Floor", (0.02, 0.02, 0.023), 0.6)
 
 
-def lights() -> None:
-    """Add the lights and the world; the small lamp stands behind the pane."""
-    for location, watts in (((-1.5, -3, 4), 900), ((2.2, 2.2, 3), 900)):
-        lamp(location, (0, 0, 0.6), 0.25, watts)
-    lamp((1.95, 1.6, 0.5), (0, -4.2, 1.6), 0.12, 3)
-    bpy.ops.object.light_add(type="SUN", rotation=degrees(55, 0, 155))
-    bpy.context.object.data.energy = 4
-    world = bpy.context.scene.world = bpy.data.worlds.new("Sky")
-    world.use_nodes = True
-    world.node_tree.nodes["Background"].inputs["Color"].default_value = (0.015, 0.018, 0.024, 1)
+def towards(location: tuple[float, ...], target: tuple[float, ...]) -> Euler:
+    """Return the rotation of a light at a location that shines on the target."""
+    return (Vector(target) - Vector(location)).to_track_quat("-Z", "Y").to_euler()
 
 
 def lamp(location: tuple[float, ...], target: tuple[float, ...], size: float, watts: float) -> None:
-    """Add a round area light that faces the target."""
-    rotation = (Vector(target) - Vector(location)).to_track_quat("-Z", "Y").to_euler()
-    bpy.ops.object.light_add(type="AREA", location=location, rotation=rotation)
+    """Add a round area light that shines on the target."""
+    bpy.ops.object.light_add(type="AREA", location=location, rotation=towards(location, target))
     added = bpy.context.object.data
     added.shape, added.size, added.energy = "DISK", size, watts
+
+
+def lights() -> None:
+    """Add the lights and the world: a high sun and lamp for the skin, and a lamp behind the pane."""
+    bpy.ops.object.light_add(type="SUN", rotation=towards((-0.4, -0.15, 0.9), (0, 0, 0)))
+    bpy.context.object.data.energy = 5
+    lamp((1.6, 0.6, 4.2), (0, 0, 0.6), 0.2, 700)
+    lamp((1.95, 1.6, 0.5), (0, -4.2, 1.6), 0.12, 3)
+    world = bpy.context.scene.world = bpy.data.worlds.new("Sky")
+    world.use_nodes = True
+    world.node_tree.nodes["Background"].inputs["Color"].default_value = (0.015, 0.018, 0.024, 1)
 
 
 def main(addon: str, output: str) -> None:
