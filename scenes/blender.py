@@ -1,8 +1,8 @@
 """A scene of Blender, exported by Mitsuba-Blender: `python scenes/blender.py ADDON exported.xml`, for docs/blender.md.
 
 ADDON is a git checkout of the add-on, with tags; `pip install bpy==4.5.15 mitsuba==3.5.0`, or `bpy==5.0.1`, in an
-environment of Python 3.11. A ring, a monkey, a pane, foil and a floor, unwrapped by Blender; a sun, two area lights and a
-dim world; Blender's own number of samples. Lengths are metres.
+environment of Python 3.11. A ring, a monkey, a pane, foil and a floor, unwrapped by Blender; a sun, two area lights and
+a dim world; Blender's own number of samples. Lengths are metres.
 """
 
 from __future__ import annotations
