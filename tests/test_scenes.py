@@ -389,3 +389,17 @@ def test_lines_are_where_the_grating_equation_has_them(llvm, name, screen, lines
         mean = (x * light).sum() / light.sum()
         measured = period * (np.sin(np.arctan(mean / screen)) + offset)
         assert measured == pytest.approx(line, rel=0.005), line
+
+
+@pytest.mark.parametrize(("work", "code"), [("print", 0), ("int", 1)])
+def test_the_script_of_blender_does_not_wait_for_exit_handlers(tmp_path, work, code):
+    """Those of Blender 4.5 as a module do not return once Mitsuba is imported; here a module takes the place of both."""
+    (tmp_path / "bpy.py").write_text("import atexit, time; atexit.register(time.sleep, 1000)")
+    (tmp_path / "mitsuba.py").touch()
+    (tmp_path / "mathutils.py").write_text("Euler = Vector = None")
+    program = f"import blender; blender.main = {work}; blender.run('of the scene', 'exported')"
+    environment = {**os.environ, "PYTHONPATH": os.pathsep.join([str(tmp_path), str(SCENES)])}
+    done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, env=environment, timeout=60)
+    assert done.returncode == code
+    assert done.stdout == ("" if code else "of the scene exported\n")  # in a pipe, so that it has to be flushed
+    assert ("Traceback" in done.stderr) == bool(code)
