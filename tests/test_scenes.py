@@ -393,7 +393,7 @@ def test_lines_are_where_the_grating_equation_has_them(llvm, name, screen, lines
 
 @pytest.mark.parametrize(("work", "code"), [("print", 0), ("int", 1)])
 def test_the_script_of_blender_does_not_wait_for_exit_handlers(tmp_path, work, code):
-    """Those of Blender 4.5 as a module do not return once Mitsuba is imported; here a module takes the place of both."""
+    """Those of Blender 4.5 as a module do not return once Mitsuba is imported; here modules take the place of both."""
     (tmp_path / "bpy.py").write_text("import atexit, time; atexit.register(time.sleep, 1000)")
     (tmp_path / "mitsuba.py").touch()
     (tmp_path / "mathutils.py").write_text("Euler = Vector = None")
