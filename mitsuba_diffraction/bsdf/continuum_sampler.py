@@ -1,9 +1,9 @@
 """A sampler of q for smooth spectra and for orders that overlap, from a table of bins.
 
-With s = k_i,∥, light diffracted at the frequency q propagates if |λq + s| ≤ n_o: q lies in a disc of the radius n_o/λ
-around −s/λ. The rows of bins that meet this disc, and in each of them the columns that do, are intervals: differences
-of cumulative sums normalise a density that is restricted to them, for any medium and any incident direction. Columns
-are summed in blocks of up to four, as large tables of sums are slow to read.
+With s = k_i,∥, light diffracted at the frequency q propagates if |λq + s| ≤ n_o: q lies in the disc of the radius
+r = n_o/λ around c = −s/λ. A q that is drawn outside of it is replaced by its inversion in the circle,
+c + r² (q − c)/|q − c|²: for any medium and any incident direction every sample propagates, and no sum over the disc is
+needed.
 """
 
 from __future__ import annotations
@@ -22,9 +22,11 @@ from .geometry import Incidence
 from .inversion import KAPPA_BINS, KappaBins, choose, cumulative_sums, mean_powers, search
 from .tables import PacketTable, ProbabilityTable, larger, opaque
 
-MAX_BIN_SPACING = 0.06  # cycles/µm, to resolve the horizon
-MAX_BLOCK_WIDTH = 0.07  # cycles/µm, of blocks of more than one bin
 MAX_BIN_WIDTH = 2.0  # in σ_q
+MAX_BIN_SPACING = 0.06  # cycles/µm, where lobes are wide
+BLOCK = 4  # columns of bins; tables of the sums of all columns would be slow to search
+MAX_LINE_WIDTH = 0.25  # standard deviation of q across lines and ridges, relative to that along the axis
+MAX_RATIO = 1e6  # r²/|q − c|², above which the inversion of q lies outside of all tables
 LOBE_CUTOFF = 4.0  # of the lobes of orders, in σ_q
 
 
@@ -63,87 +65,105 @@ class BinAxis:
 
 
 class BinSampler:
-    """The density of q on the bin in column m and row r, |q_x − mΔ_x| ≤ Δ_x/2 and |q_y − rΔ_y| ≤ Δ_y/2:
+    """The density of q in the disc of propagating light, f(q) of the table and that of its inversion q′ in the circle:
 
-        p(q) = Σ_j w_j A_jrm/(M_j C_jr) / (Δ_x Δ_y)
+        p(q) = f(q) + f(q′) r⁴/|q − c|⁴,    f(q) = Σ_j w_j A_jnm/M_j / (Δ_x Δ_y)
 
-    It is a mixture over κ (`KappaBins`). A_jrm is the mean power in the bin, M_j its sum over the rows of the disc, and
-    C_jr the fraction of row r in the blocks of columns that meet the disc. A bin is drawn by two binary searches, for
-    its row and for its block; the density at a given q reads one word and four packets.
+    with A_jnm the mean power, in a bin of κ (`KappaBins`), of the bin in row n and column m, |q_x − mΔ_x| ≤ Δ_x/2 and
+    |q_y − nΔ_y| ≤ Δ_y/2. M_j is their sum. Of lines and ridges, whose q is spread along one axis, much light may be
+    evanescent: only the rows that meet the disc are drawn and summed. Rows lie across the axis of the larger spread.
+
+    A bin is drawn by two binary searches, for its row and for its block of columns; the density at a given q reads two
+    words, of lines and ridges two packets more.
     """
 
     def __init__(self, spectrum: GratingSpectrum, typical_max_kappa: float | None = None) -> None:
         self.kappa_bins = KappaBins(spectrum.max_kappa, typical_max_kappa)
         along_x, along_y = (BinAxis.of(spectrum, axis) for axis in (0, 1))
-        probabilities = along_y.integrals @ mean_powers(spectrum, self.kappa_bins) @ along_x.integrals.T
+        powers = along_y.integrals @ mean_powers(spectrum, self.kappa_bins) @ along_x.integrals.T
         # Coefficients of splines may be negative.
-        probabilities = np.moveaxis(np.maximum(probabilities, 0), 0, -1)
-        shift = max(bits for bits in range(3) if bits == 0 or along_x.spacing * 2**bits <= MAX_BLOCK_WIDTH)
-        per_block = 2**shift
-        probabilities = np.pad(probabilities, ((0, 0), (0, -probabilities.shape[1] % per_block), (0, 0)))
-        in_blocks = probabilities.reshape(len(probabilities), -1, per_block, KAPPA_BINS)
-        self.probabilities = ProbabilityTable(np.pad(in_blocks, ((0, 0), (0, 0), (0, 4 - per_block), (0, 0))))
-        of_blocks = self.probabilities.values.astype(np.float64).sum(axis=2)
+        powers = np.moveaxis(np.maximum(powers, 0), 0, -1)
+        spread_x, spread_y = (
+            axis.spacing * np.sqrt(np.average(np.arange(-axis.max_index, axis.max_index + 1) ** 2, weights=weights))
+            for axis, weights in ((along_x, powers.sum((0, 2))), (along_y, powers.sum((1, 2))))
+        )
+        self.is_line = min(spread_x, spread_y) < MAX_LINE_WIDTH * max(spread_x, spread_y)
+        self.transposed = spread_x > spread_y
+        if self.transposed:
+            powers, along_x, along_y = powers.swapaxes(0, 1), along_y, along_x
+        powers = np.pad(powers, ((0, 0), (0, -powers.shape[1] % BLOCK), (0, 0)))
+        self.powers = ProbabilityTable(powers)
+        of_blocks = self.powers.values.astype(np.float64).reshape(len(powers), -1, BLOCK, KAPPA_BINS).sum(axis=2)
         of_rows = of_blocks.sum(axis=1)
         self.rows, self.blocks = of_blocks.shape[:2]
         self.cumulative_rows = PacketTable(cumulative_sums(of_rows))
         self.cumulative_blocks = PacketTable(cumulative_sums(of_blocks / np.maximum(of_rows[:, None], 1e-30)))
-        self.shift, self.last_in_block = mi.Int32(shift), mi.Int32(per_block - 1)
-        dr.make_opaque(self.shift, self.last_in_block)
-        self.max_index_x, self.max_index_y = along_x.max_index, along_y.max_index
-        self.spacing_x, self.spacing_y = opaque(along_x.spacing), opaque(along_y.spacing)
-        self.per_q_x, self.per_q_y = opaque(1 / along_x.spacing), opaque(1 / along_y.spacing)
+        self.total = mi.Vector4f(*map(opaque, of_rows.sum(axis=0)))
+        self.max_index = along_x.max_index, along_y.max_index
+        self.spacing = opaque(along_x.spacing), opaque(along_y.spacing)
+        self.per_q = opaque(1 / along_x.spacing), opaque(1 / along_y.spacing)
 
     def density(self, q: mi.Vector2f, incidence: Incidence, active: mi.Bool) -> mi.Float:
         """Return p(q) in µm² of a propagating q in cycles/µm, for one wavelength."""
-        m_x, m_y = mi.Int32(dr.round(q.x * self.per_q_x)), mi.Int32(dr.round(q.y * self.per_q_y))
-        active = active & (dr.abs(m_x) <= self.max_index_x) & (dr.abs(m_y) <= self.max_index_y)
-        row, column = m_y + self.max_index_y, m_x + self.max_index_x
-        index = 4 * (row * self.blocks + (column >> self.shift)) + (column & self.last_in_block)
-        fractions = self.probabilities(mi.UInt32(index), active)
-        first, end = self._rows_of_disc(incidence)
-        mass = self.cumulative_rows(mi.UInt32(end), active) - self.cumulative_rows(mi.UInt32(first), active)
-        first, end = (mi.UInt32(row * (self.blocks + 1) + i) for i in self._blocks_of_disc(row, incidence))
-        mass *= self.cumulative_blocks(end, active) - self.cumulative_blocks(first, active)
+        centre, q = self._axes(-incidence.tangent * incidence.frequency), self._axes(q)
+        rows, mass = self._rows(centre, incidence), self.total
+        if self.is_line:
+            first, end = (self.cumulative_rows(mi.UInt32(row), active) for row in rows)
+            mass = end - first
+        inverse, ratio = _inverted(q, centre, incidence.radius)
+        of_inverse = self._powers(inverse, rows, active & (ratio < MAX_RATIO))
+        powers = dr.fma(dr.square(ratio), of_inverse, self._powers(q, rows, active))
         weights = self.kappa_bins.weights(incidence) * dr.select(mass > 1e-20, dr.rcp(mass), 0)
-        return dr.dot(weights, fractions) * self.per_q_x * self.per_q_y
+        return dr.dot(weights, powers) * self.per_q[0] * self.per_q[1]
+
+    def _powers(self, q: mi.Vector2f, rows: tuple[mi.Int32, mi.Int32], active: mi.Bool) -> mi.Vector4f:
+        """Return the powers of the bin that contains q."""
+        column, row = (
+            mi.Int32(dr.round(of * per_q)) + max_index
+            for of, per_q, max_index in zip(q, self.per_q, self.max_index, strict=True)
+        )
+        active = active & (row >= rows[0]) & (row < rows[1]) & (column >= 0) & (column < BLOCK * self.blocks)
+        return self.powers(mi.UInt32(row * (BLOCK * self.blocks) + column), active)
 
     def sample(self, incidence: Incidence, u: mi.Float, v: mi.Point2f, active: mi.Bool) -> mi.Point2f:
         """Draw q in cycles/µm, for one wavelength.
 
-        `u` chooses the κ bin and the row, `v.x` the block, the column and q_x in the bin, `v.y` q_y in the bin.
+        `u` chooses the κ bin and the row, `v.x` the block, the column and the position in it, `v.y` that in the row.
         """
+        centre = self._axes(-incidence.tangent * incidence.frequency)
         kappa_bin, u = choose(self.kappa_bins.weights(incidence), u)
 
         def cumulative(table: PacketTable, index: mi.Int32) -> mi.Float:
             return table.component(mi.UInt32(index), kappa_bin, active)
 
-        rows = self._rows_of_disc(incidence)
+        rows, blocks = self._rows(centre, incidence), (mi.Int32(0), mi.Int32(self.blocks))
         row, _ = search(lambda i: cumulative(self.cumulative_rows, i), *rows, self.rows, u)
-        start, blocks = row * (self.blocks + 1), self._blocks_of_disc(row, incidence)
+        start = row * (self.blocks + 1)
         block, x = search(lambda i: cumulative(self.cumulative_blocks, start + i), *blocks, self.blocks, v.x)
-        column, x = choose(self.probabilities.block(mi.UInt32(row * self.blocks + block), kappa_bin, active), x)
-        m_x = mi.Float((block << self.shift) + mi.Int32(column) - self.max_index_x)
-        m_y = mi.Float(row - self.max_index_y)
-        return mi.Point2f((m_x + x - 0.5) * self.spacing_x, (m_y + v.y - 0.5) * self.spacing_y)
+        column, x = choose(self.powers.block(mi.UInt32(row * self.blocks + block), kappa_bin, active), x)
+        bins = mi.Point2f(BLOCK * block + mi.Int32(column) - self.max_index[0], row - self.max_index[1])
+        q = mi.Point2f((bins.x + x - 0.5) * self.spacing[0], (bins.y + v.y - 0.5) * self.spacing[1])
+        inverse, ratio = _inverted(q, centre, incidence.radius)
+        return self._axes(dr.select(ratio < 1, inverse, q))
 
-    def _rows_of_disc(self, incidence: Incidence) -> tuple[mi.Int32, mi.Int32]:
-        """Return the first and the end of the rows that contain propagating q."""
-        middle = -incidence.tangent.y * incidence.frequency
-        return _interval(middle, incidence.radius, self.per_q_y, self.max_index_y)
+    def _axes(self, q: mi.Vector2f) -> mi.Vector2f:
+        """Return components along columns and along rows from those along x and y, or vice versa."""
+        return type(q)(q.y, q.x) if self.transposed else q
 
-    def _blocks_of_disc(self, row: mi.Int32, incidence: Incidence) -> tuple[mi.Int32, mi.Int32]:
-        """Return the first and the end of the blocks of columns that contain propagating q in a row."""
-        middle_x, middle_y = -incidence.tangent * incidence.frequency
-        distance = dr.abs(mi.Float(row - self.max_index_y) * self.spacing_y - middle_y) - 0.5 * self.spacing_y
-        half = dr.safe_sqrt(dr.square(incidence.radius) - dr.square(larger(distance, 0)))
-        first, end = _interval(middle_x, half, self.per_q_x, self.max_index_x)
-        return first >> self.shift, (end + self.last_in_block) >> self.shift
+    def _rows(self, centre: mi.Vector2f, incidence: Incidence) -> tuple[mi.Int32, mi.Int32]:
+        """Return the first and the end of the rows to draw from, at least one."""
+        if not self.is_line:
+            return mi.Int32(0), mi.Int32(self.rows)
+        distance = larger(dr.abs(centre.x) - (self.max_index[0] + 0.5) * self.spacing[0], 0)
+        half = dr.safe_sqrt(dr.square(incidence.radius) - dr.square(distance))
+        first = mi.Int32(dr.floor(dr.fma(centre.y - half, self.per_q[1], 0.5))) + self.max_index[1]
+        end = mi.Int32(dr.ceil(dr.fma(centre.y + half, self.per_q[1], 0.5))) + self.max_index[1]
+        first = dr.clip(first, 0, self.rows - 1)
+        return first, dr.clip(end, first + 1, self.rows)
 
 
-def _interval(middle: mi.Float, half: mi.Float, per_q: mi.Float, max_index: int) -> tuple[mi.Int32, mi.Int32]:
-    """Return the first and the end of the bins that meet an interval of q, at least one bin."""
-    first = mi.Int32(dr.floor(dr.fma(middle - half, per_q, 0.5))) + max_index
-    end = mi.Int32(dr.ceil(dr.fma(middle + half, per_q, 0.5))) + max_index
-    first = dr.clip(first, 0, 2 * max_index)
-    return first, dr.clip(end, first + 1, 2 * max_index + 1)
+def _inverted(q: mi.Vector2f, centre: mi.Vector2f, radius: mi.Float) -> tuple[mi.Vector2f, mi.Float]:
+    """Return the inversion of q in a circle, c + (q − c) r²/|q − c|², and r²/|q − c|²."""
+    from_centre = q - centre
+    ratio = dr.square(radius) / larger(dr.squared_norm(from_centre), 1e-12)
+    return dr.fma(ratio, from_centre, centre), ratio
