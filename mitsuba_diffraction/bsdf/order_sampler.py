@@ -62,7 +62,7 @@ class OrderSampler:
         is_sheet: bool = False,
         coat_index: float = 1.0,
         height_scales: Sequence[float] = (1.0,),
-        min_lateral_scale: float = 1.0,
+        laterals: tuple[float, float] = (1.0, 1.0),
     ) -> None:
         """Make the table.
 
@@ -72,14 +72,13 @@ class OrderSampler:
             is_sheet: whether there is a flat lower face, with the upper medium below it.
             coat_index: of a layer over the relief, relative to the outside.
             height_scales: factors of the heights, ascending; each interval between two of them has its own bins.
-            min_lateral_scale: minimum factor of the lengths along the surface, by which heights are divided.
+            laterals: bounds of the factor of lengths along the surface, by which heights are divided.
         """
         grid = cast(OrderGrid, spectrum.grid)
         self.transmits, self.is_sheet = eta is not None, is_sheet
         self.eta, self.coat_index = eta or 1.0, coat_index
         self.tile, self.max_order = np.array(grid.tile_size), np.array(grid.max_order)
-        first, last = (frequency / coat_index for frequency in frequencies_of(spectrum, eta))
-        first *= min(min_lateral_scale, 1)
+        first, last = (frequency / coat_index for frequency in frequencies_of(spectrum, eta, laterals))
         sides = (True, False) if self.transmits else (True,)
         phase = 4 * np.pi * spectrum.height_range * float(np.mean(height_scales)) * (last - first)
         max_phase = MAX_LINE_PHASE if 0 in grid.max_order else MAX_PHASE

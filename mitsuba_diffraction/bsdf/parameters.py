@@ -120,15 +120,14 @@ class Scales:
         return height / lateral, lateral
 
     @property
-    def min_lateral(self) -> float:
-        """The minimum lateral scale."""
-        return 1.0 if self.lateral is None else float(self.lateral.values[0])
+    def laterals(self) -> tuple[float, float]:
+        """Bounds of the lateral scale."""
+        return (1.0, 1.0) if self.lateral is None else (float(self.lateral.values[0]), float(self.lateral.values[-1]))
 
     def ratios(self) -> tuple[float, float]:
         """Return bounds of the ratio of height scale to lateral scale."""
-        low, high = self.height.values[[0, -1]]
-        max_lateral = 1.0 if self.lateral is None else self.lateral.values[-1]
-        return float(low / max_lateral), float(high / self.min_lateral)
+        (low, high), (min_lateral, max_lateral) = self.height.values[[0, -1]], self.laterals
+        return float(low / max_lateral), float(high / min_lateral)
 
     def check(self, wavelengths: tuple[float, float], shortest: float, max_resolved: float | None) -> None:
         """Check the values against the range of a spectrum.

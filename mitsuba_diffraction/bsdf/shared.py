@@ -80,7 +80,7 @@ class SharedTables:
             return cast("OrderSpectrum | SplineSpectrum", self.table)
         low, high = scales.ratios()
         ratios = np.linspace(low, high, 1 if low == high else SAMPLER_RATIOS)
-        key = is_sheet, coat_index, ratios.tolist(), scales.min_lateral
+        key = is_sheet, coat_index, ratios.tolist(), scales.laterals
         with self._lock:
             if self._drawn is None or self._drawn[0] != key:
                 sampler = OrderSampler(cast(GratingSpectrum, self._spectrum), self._eta, *key)
@@ -99,10 +99,10 @@ class SharedTables:
             half = 1 / max(per_step, 10)
             low, high = max(low - half, 0.0), low + half
         count = 1 if low == high else int(np.clip(np.ceil((high - low) * per_step), 1, MAX_RATIOS - 1)) + 1
-        key = np.linspace(low, high, count).tolist(), min(scales.min_lateral, 1.0)
+        key = np.linspace(low, high, count).tolist(), scales.laterals
         with self._lock:
             if self._energy is None or self._energy[0] != key:
-                if key == ([1.0], 1.0) and self._eta is None:
+                if key == ([1.0], (1.0, 1.0)) and self._eta is None:
                     table = spectrum.energy_table()
                 else:
                     table = EnergyTable.of(spectrum, key[0], self._eta, key[1])

@@ -66,6 +66,7 @@ class Furnace:
         widths: (n,) cycles/µm, their standard deviations.
         powers: float32 (n, K), at K equidistant κ from 0 to κ_max of the spectrum, for unscaled heights.
         height_scale: the factor of the heights.
+        lobe_scale: the factor of the widths of lobes of orders.
     """
 
     spectrum: PowerSpectrum = field(repr=False)
@@ -75,10 +76,16 @@ class Furnace:
     widths: Real = field(repr=False)
     powers: NDArray[np.float32] = field(repr=False)
     height_scale: float = 1.0
+    lobe_scale: float = 1.0
 
     @classmethod
     def of(
-        cls, spectrum: PowerSpectrum, height_scale: float = 1.0, index: float | None = None, side: int = 1
+        cls,
+        spectrum: PowerSpectrum,
+        height_scale: float = 1.0,
+        index: float | None = None,
+        side: int = 1,
+        lobe_scale: float = 1.0,
     ) -> Furnace:
         """Return the components of `spectrum`.
 
@@ -87,6 +94,7 @@ class Furnace:
             height_scale: the factor of the heights.
             index: n below relative to n above, if light is transmitted.
             side: 1 if ω is above the surface; −1 if below, where the surface has the heights −h and S(−q; κ).
+            lobe_scale: the factor of the widths of lobes of orders.
         """
         grid, max_kappa = spectrum.grid, spectrum.max_kappa
         by_order = isinstance(grid, OrderGrid) and (1 in grid.shape or all(lobe.count == 1 for lobe in spectrum.lobes))
@@ -106,7 +114,7 @@ class Furnace:
         kept = powers.max(-1) > 1e-7
         powers = np.ascontiguousarray(np.maximum(powers[kept], 0), np.float32)
         relative_index = None if index is None else float(index) ** side
-        return cls(spectrum, relative_index, by_order, side * q[kept], widths[kept], powers, height_scale)
+        return cls(spectrum, relative_index, by_order, side * q[kept], widths[kept], powers, height_scale, lobe_scale)
 
     @property
     def branches(self) -> tuple[int, ...]:
@@ -154,10 +162,11 @@ class Furnace:
         square, j = square[i, j], near[j]
         if not self.by_order:
             return self._bin_terms(i, j, np.sqrt(1 - square), cos_i, length, branch)
-        sigma = length[i] * self.spectrum.lobe_width
+        width = self.lobe_scale * self.spectrum.lobe_width
+        sigma = length[i] * width
         cos_exit = cos_o = mean_cosine(square, sigma / index)
         weight: Real | float = 1.0
-        if 2 * np.pi * self.spectrum.height_range * self.height_scale * self.spectrum.lobe_width > MAX_LOBE_PHASE:
+        if 2 * np.pi * self.spectrum.height_range * self.height_scale * width > MAX_LOBE_PHASE:
             cos_exit, cos_o, weight = _over_lobe(square, sigma / index)
             i, j, sigma = np.tile(i, LOBE_POINTS), np.tile(j, LOBE_POINTS), np.tile(sigma, LOBE_POINTS)
         cos_i, length = cos_i[i], length[i]

@@ -107,11 +107,10 @@ class Layout:
         return self.slices, self.side + self.squares, self.side + self.squares
 
     @classmethod
-    def of(cls, furnace: Furnace, min_lateral_scale: float = 1.0) -> Layout:
+    def of(cls, furnace: Furnace, laterals: tuple[float, float] = (1.0, 1.0)) -> Layout:
         """Choose the layout: as fine as `MAX_NODES` and `MAX_NODE_COMPONENT_PAIRS` allow."""
         spectrum, grid = furnace.spectrum, furnace.spectrum.grid
-        min_frequency, max_frequency = frequencies_of(spectrum, furnace.index)
-        frequencies = min_frequency * min(min_lateral_scale, 1), max_frequency
+        frequencies = frequencies_of(spectrum, furnace.index, laterals)
         if furnace.index is not None or not (isinstance(grid, OrderGrid) and 1 in grid.shape):
             nodes = min(MAX_NODE_COMPONENT_PAIRS / (len(furnace.q) * (1 if furnace.index is None else 6)), MAX_NODES)
             return cls(0.0, 1, max(int(np.sqrt(nodes / SLICES)) - 1, 8), 1, SLICES, frequencies)
@@ -120,8 +119,8 @@ class Layout:
         side = np.sqrt(2 * min(MAX_LINE_NODES, MAX_NODE_COMPONENT_PAIRS / max(len(furnace.q) / 2, 1)))
         first = int(np.clip(side / 8, 4, 24))
         period, rest = grid.tile_size[int(turned)], (side - 2 * first - 1) / 3
-        period /= max(np.ceil(2 * period * max_frequency / max(rest, 2)), 1)
-        squares = int(np.ceil(2 * period * max_frequency))
+        period /= max(np.ceil(2 * period * frequencies[1] / max(rest, 2)), 1)
+        squares = int(np.ceil(2 * period * frequencies[1]))
         cells = int(np.clip((3 * rest / max(squares - 1, 1) - 1) / 2, 1, 48))
         return cls(float(period), squares, first, cells, 1, frequencies, turned)
 
@@ -207,7 +206,7 @@ class EnergyTable:
         spectrum: PowerSpectrum,
         ratios: Sequence[float] = (1.0,),
         index: float | None = None,
-        min_lateral_scale: float = 1.0,
+        laterals: tuple[float, float] = (1.0, 1.0),
     ) -> EnergyTable:
         """Compute the table of `spectrum`.
 
@@ -215,10 +214,11 @@ class EnergyTable:
             spectrum: S(q; κ); for an interface, of wavelengths in the denser medium.
             ratios: the nodes of h/s, equidistant.
             index: n below relative to n above, if light is transmitted.
-            min_lateral_scale: the minimum of s.
+            laterals: bounds of s.
         """
-        sides = [Furnace.of(spectrum, max(ratios), index, side) for side in ((1,) if index is None else (1, -1))]
-        layout = Layout.of(sides[0], min_lateral_scale)
+        above_and_below = (1,) if index is None else (1, -1)
+        sides = [Furnace.of(spectrum, max(ratios), index, side, laterals[0]) for side in above_and_below]
+        layout = Layout.of(sides[0], laterals)
         e = _bounds(layout, sides, ratios, layout.nodes()).reshape(len(ratios), -1, *layout.shape)
         # e varies fast where an order is just above the horizon, and in deep reliefs: where it is less at the centre of
         # a grid cell than between the corners, they are lowered by the difference.
@@ -297,11 +297,13 @@ def _bounds(layout: Layout, sides: Sequence[Furnace], ratios: Sequence[float], p
     return e
 
 
-def frequencies_of(spectrum: PowerSpectrum, index: float | None) -> tuple[float, float]:
-    """Return (minimum, maximum) of 1/λ in 1/µm for a table; `index` is η of `Furnace`."""
-    # The wavelengths of the spectrum are in the denser medium.
+def frequencies_of(
+    spectrum: PowerSpectrum, index: float | None, laterals: tuple[float, float] = (1.0, 1.0)
+) -> tuple[float, float]:
+    """Return (minimum, maximum) of s/λ in 1/µm for a table; `index` is η of `Furnace`, `laterals` are bounds of s."""
+    # The wavelengths of the spectrum are in the denser medium, and are shorter for s > 1.
     shortest, longest = (w * 1e-3 * max(index or 1, 1) for w in spectrum.wavelengths)
-    return 1 / longest, 1 / shortest
+    return min(laterals[0], 1) / longest, min(laterals[1], 1) / shortest
 
 
 def bounds_of(albedo: Real, index: float | None) -> Real:

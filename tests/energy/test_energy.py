@@ -160,6 +160,15 @@ def test_no_albedo_above_one_for_scaled_heights(height_scale):
     assert (mean - 3 * error).max() <= 1.01
 
 
+def test_no_albedo_above_one_for_scaled_lengths():
+    # Regression: up to 1.15, as the lobes of the table were not scaled, and its nodes were far apart.
+    grating = {"type": "diffraction_grating", "profile": "sinusoidal", "period": 2.0, "depth": 0.2, "material": "none"}
+    bsdf = mi.load_dict({**grating, "lateral_scale": 0.3, "height_scale": 1.7})
+    omega, wavelengths = random_directions(np.random.default_rng(7), 48)
+    mean, error = albedos(bsdf, omega, wavelengths, 1 << 12)
+    assert (mean - 3 * error).max() <= 1.01
+
+
 def energies(bsdf, omega, wavelength):
     """e of the table, (n,)."""
     energy = bsdf.layers.grating.theory.energy
