@@ -90,6 +90,7 @@ def test_weights_are_value_over_density_and_average_to_the_albedo(name):
     np.testing.assert_array_less(np.abs(weight.mean(1) - wanted), 4 * error + 2e-3 * wanted)
 
 
+@pytest.mark.few(2)
 @pytest.mark.parametrize(
     ("base", "theta"),
     [
@@ -250,7 +251,7 @@ def test_samples_follow_a_textured_base():
     assert max(shares) > 2 * min(shares)
 
 
-@pytest.mark.few(6)
+@pytest.mark.few(3)
 @pytest.mark.parametrize("theta", [0, 70, 89, *(pytest.param(x, marks=pytest.mark.slow) for x in (30, 45, 80, 85))])
 @pytest.mark.parametrize("base", [{"type": "diffuse", "reflectance": uniform(1.0)}, {"type": "conductor"}])
 @pytest.mark.parametrize("name", ["blazed", "deep blazed", "elaphe"])

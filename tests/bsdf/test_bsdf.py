@@ -221,6 +221,7 @@ def test_samples_follow_their_density_and_carry_the_albedo(llvm, theta):
     np.testing.assert_allclose(weight.mean(1), [albedo(surface("blazed"), wi, x) for x in WAVELENGTHS], rtol=0.03)
 
 
+@pytest.mark.few(2)
 @pytest.mark.parametrize("theta", [0, 30, 60])
 @pytest.mark.parametrize("name", ["blazed", "crossed"])
 def test_samples_pass_the_chi_square_test(llvm, name, theta):

@@ -157,9 +157,13 @@ def test_a_wrong_coat_is_refused(llvm, parameters, text):
 @pytest.mark.parametrize(
     ("layer", "without"),
     [
-        ({"coat_ior": 1.0, "material": "Al"}, {"material": "Al"}),
+        pytest.param({"coat_ior": 1.0, "material": "Al"}, {"material": "Al"}, marks=pytest.mark.slow),
         ({"coat_ior": "air", "int_ior": 1.8}, {"int_ior": 1.8}),
-        ({"coat_ior": 1.33, "ext_ior": 1.33, "int_ior": 1.8}, {"ext_ior": 1.33, "int_ior": 1.8}),
+        pytest.param(
+            {"coat_ior": 1.33, "ext_ior": 1.33, "int_ior": 1.8},
+            {"ext_ior": 1.33, "int_ior": 1.8},
+            marks=pytest.mark.slow,
+        ),
         # A layer of the index of water on a metal in water.
         (
             {"coat_ior": 1.33, "ext_ior": 1.33, "material": "Al"},

@@ -24,10 +24,15 @@ GRATINGS = {
     "rigorous": lambda: of_spectrum(made_up(), material="Al"),
 }
 POLARISED = [name for name in GRATINGS if name != "rigorous"]  # the table that is made up has no Mueller matrices
-CASES = [("llvm_ad_spectral", name) for name in GRATINGS]
-CASES += [
-    pytest.param(("llvm_ad_spectral_polarized", name), marks=[pytest.mark.slow] * (name not in ("line", "interface")))
-    for name in POLARISED
+# A coat contains a line, and the polarised interface what is computed for the other variant and for a sheet.
+DEFAULT = {("llvm_ad_spectral", name) for name in ("coat", "crossed", "sample", "base", "rigorous")}
+DEFAULT |= {("llvm_ad_spectral_polarized", "interface")}
+CASES = [
+    pytest.param(case, marks=[pytest.mark.slow] * (case not in DEFAULT))
+    for case in (
+        *(("llvm_ad_spectral", name) for name in GRATINGS),
+        *(("llvm_ad_spectral_polarized", name) for name in POLARISED),
+    )
 ]
 COUNT = 300
 

@@ -38,7 +38,7 @@ def mean(bsdf, film):
     return np.array(mi.render(mi.load_dict(scene(bsdf, film)), spp=1024)).mean() / (film[1] - film[0])
 
 
-@pytest.mark.parametrize("coat", [{}, {"coat_ior": 1.3}])
+@pytest.mark.parametrize("coat", [pytest.param({}, marks=pytest.mark.slow), {"coat_ior": 1.3}])
 def test_a_spectrum_for_shorter_wavelengths_holds_for_longer_ones(llvm, coat):
     # Regression: a spectrum built for a coat of 1.55 and used with a thinner one, or none, was black above 535 nm.
     short, exact = (spectrum(360 / n, 830 / n) for n in (1.55, 1.3 if coat else 1.0))

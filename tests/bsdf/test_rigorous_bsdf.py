@@ -121,6 +121,7 @@ def test_samples_have_even_weights_that_average_to_the_efficiencies(llvm, spectr
         assert albedo <= 1 + 1e-3
 
 
+@pytest.mark.few(2)
 @pytest.mark.parametrize("theta", [0, 40, 75])
 def test_samples_pass_the_chi_square_test(llvm, solved, theta):
     wide = dataclasses.replace(solved, coherence_length=3.0)

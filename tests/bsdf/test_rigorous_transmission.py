@@ -88,7 +88,7 @@ def power_in_table(spectrum, wi, wo, m):
     return (eta * density).sum() * area / (spectrum.lobe_width * WAVELENGTH) ** 2
 
 
-@pytest.mark.few(4)
+@pytest.mark.few(2)
 @pytest.mark.parametrize("side", [1, -1])
 @pytest.mark.parametrize(("theta", "phi"), [(0, 0), (25, 40), (35, 200), (60, 95)])
 def test_orders_have_the_powers_of_the_table(glass, theta, phi, side):
@@ -135,7 +135,7 @@ def test_transmission_and_reflection_are_reciprocal(glass):
     np.testing.assert_allclose(radiance, there * n_i**2, rtol=1e-5, atol=1e-5 * radiance.max())
 
 
-@pytest.mark.few(4)
+@pytest.mark.few(2)
 @pytest.mark.parametrize("side", [1, -1])
 @pytest.mark.parametrize("component", [0, 1])
 def test_samples_follow_the_density_on_both_sides(glass, side, component):
@@ -145,7 +145,7 @@ def test_samples_follow_the_density_on_both_sides(glass, side, component):
     check_chi_square(bsdf, wi, WAVELENGTHS, ctx, cases=8, side=side if component == 0 else -side)
 
 
-@pytest.mark.few(4)
+@pytest.mark.few(2)
 @pytest.mark.parametrize("theta", [0, 40, 75])
 @pytest.mark.parametrize("side", [1, -1])
 def test_weights_average_to_the_efficiencies(glass, theta, side):
@@ -215,6 +215,7 @@ def test_mueller_matrices_are_those_of_the_table(glass, variant):
     assert seen >= 7
 
 
+@pytest.mark.few(1)
 @pytest.mark.parametrize("variant", ["llvm_ad_spectral_polarized"])
 def test_other_variants_have_equal_values(glass, variant):
     directions = towards(20, 30, 1), towards(50, 250, -1)

@@ -91,7 +91,7 @@ def test_constant_scales_equal_a_grating_built_with_them(llvm, surface, orders, 
     np.testing.assert_allclose(found, wanted, rtol=2e-3, atol=5e-4 * wanted.max())
 
 
-@pytest.mark.few(2)
+@pytest.mark.few(1)
 @pytest.mark.parametrize("lateral", [1.4, 0.6])
 @pytest.mark.parametrize(
     ("surface", "parameters"), [(SURFACES["blazed"], {}), (corner, {}), (SURFACES["blazed"], TRANSMITS)]

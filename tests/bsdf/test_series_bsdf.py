@@ -56,6 +56,7 @@ def test_overlapping_orders_have_the_values_of_the_table(kind):
     np.testing.assert_allclose(got / scale, of.evaluate(q, kappa), atol=1e-5 * peak)
 
 
+@pytest.mark.few(2)
 @EACH
 @pytest.mark.parametrize("name", ["blazed", "rough"])
 def test_samples_pass_the_chi_square_test(name, kind):
@@ -71,7 +72,7 @@ def test_scaled_heights_have_the_values_of_that_depth(kind):
     np.testing.assert_allclose(got[:, 0], wanted, rtol=3e-3, atol=1e-3 * wanted.max())
 
 
-@pytest.mark.few(4)
+@pytest.mark.few(2)
 @EACH
 @pytest.mark.parametrize("coherence_length", [65.0, 3.0])
 @pytest.mark.parametrize("mode", ["forward", "backward"])

@@ -128,7 +128,9 @@ def test_noise_is_estimated_from_two_halves():
 # --- Quirks -----------------------------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("kind", VARIANTS)
+@pytest.mark.parametrize(
+    "kind", [pytest.param(kind, marks=[pytest.mark.slow] * (kind in ("nmm", "pq"))) for kind in VARIANTS]
+)
 def test_each_shader_names_the_quirks_that_change_it(kind):
     mi.set_variant("llvm_ad_spectral")
     surface = md.HeightField(np.random.default_rng(1).normal(0, 0.05, (14, 16)), 0.3)

@@ -475,6 +475,7 @@ def test_the_available_memory_is_that_of_the_system():
 DIRECTIONAL = '<emitter type="directional"><vector name="direction" x="0" y="0" z="-1"/></emitter>'
 
 
+@pytest.mark.few(3)
 @pytest.mark.parametrize("light", [CONSTANT, DIRECTIONAL])
 @pytest.mark.parametrize(("value", "words"), [(np.nan, "not finite"), (np.inf, "not finite"), (1e14, "is 1e+14, far")])
 def test_a_wrong_pixel_is_a_warning_that_names_it(llvm, tmp_path, monkeypatch, caplog, light, value, words):
