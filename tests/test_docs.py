@@ -267,7 +267,7 @@ def test_what_the_page_on_the_thesis_names_exists(command):
     for name, member in re.findall(r"`([\w/]+\.py)` \(`(\w+)`\)", text):
         path = PACKAGE / name if (PACKAGE / name).is_file() else ROOT / name
         assert re.search(rf"^ *(?:def|class) {member}\b", path.read_text(), re.MULTILINE), (name, member)
-    for page, anchor in re.findall(r"\]\(([\w./]*)#?([\w-]*)\)", text):
+    for page, anchor in re.findall(r"\]\(((?:[\w./]*\.md)?)#?([\w-]*)\)", text):
         headings = re.findall(r"^#+ (.*)$", (ROOT / "docs" / (page or "thesis.md")).read_text(), re.MULTILINE)
         assert not anchor or anchor in {slugify(heading.replace("`", ""), "-") for heading in headings}, (page, anchor)
     for name, *words in map(str.split, re.findall(r"`mitsuba-diffraction ([^`]*)`", text)):

@@ -144,7 +144,8 @@ class ScalarTheory(Theory):
 
     def __init__(self, spectrum: GratingSpectrum, request: GratingRequest) -> None:
         if spectrum.warning:
-            _warn_of_range(spectrum.source, spectrum.warning)
+            of_glass = "" if request.material.transparent else "; this is the error of glass, that of metals differs"
+            _warn_of_range(spectrum.source, spectrum.warning + of_glass)
         self.spectrum, self.media, self.scales = spectrum, request.media, request.scales
         self.material, self.shadowing = request.material, request.shadowing
         self.conserve_energy = request.conserve_energy
