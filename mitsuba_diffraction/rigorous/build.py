@@ -9,7 +9,7 @@ import itertools
 import os
 import time
 import warnings
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import suppress
 from pathlib import Path
@@ -21,7 +21,7 @@ from numpy.typing import NDArray
 
 from ..errors import RequestError
 from ..files import whole_file
-from ..progress import Progress, part, silent
+from ..progress import Progress, silent, stage
 from ..settings import Settings
 from ..surface.heightfield import HeightField
 from .coordinate_transformation import ABOVE, BELOW, Curve, Grating, HalfSpace, Scattered, curve_of, half_space, scatter
@@ -65,6 +65,7 @@ _MIN_SQUARE = 1e-8  # |γ²|
 _MIN_K_Y = 1e-4  # matrices are divided by k_y
 _MAX_ANOMALY_DISTANCE = 0.02  # of P or R from an integer, near a Rayleigh anomaly
 _CHECK_COUNT = 200
+_PAIR_WORK = 0.2  # of matching a field above and one below, in units of the eigenproblem of one field; measured
 _CHECKPOINT_SECONDS = 20.0  # between checkpoints, each of which is written as a whole
 # Directions for which the harmonics are chosen: near the normal, and oblique from both sides.
 _HARMONICS_DIRECTIONS = ((0.1, 0, 1), (0.8, 0.3, 0.5), (-0.8, 0.3, 0.5))
@@ -85,7 +86,8 @@ def build_spectrum(
         height_field: the surface; rows that differ are refused.
         settings: of rigorous theory. The tolerance bounds `RigorousSpectrum.error`, the mean of Σ|Δη_m| / Σ η_m over
             directions and wavelengths, and a third of `polarisation_error`.
-        progress: called with (per cent done, 100), never decreasing.
+        progress: called with (per cent done, 100) of the work of one table. It begins anew if a finer table is
+            needed, which is known only when the error of the first is.
         checkpoints: a folder for intermediate results, from which an interrupted build resumes.
 
     Raises:
@@ -104,15 +106,14 @@ def build_spectrum(
             f"{MAX_PERIOD_IN_WAVELENGTHS:g} times the shortest wavelength; use theory=scalar"
         )
     with one_thread():
-        surface = _Surface(height_field, settings, tolerance)
-        checks = surface.checks()
-        error, done = np.inf, 0
+        with stage("reference solutions"):
+            surface = _Surface(height_field, settings, tolerance)
+            checks = surface.checks()
         steps = _SOLVED_STEPS if settings.transmission == "none" else _SOLVED_STEPS_TRANSMISSION
-        for solved in steps:
-            # Half as many steps again more than halve the error: an error of two tolerances predicts the last table.
-            begin, done = done, 95 if error <= 2 * tolerance or solved == steps[-1] else done + 20
-            build = _Build(surface, solved, settings.polarised)
-            values, mueller = build.table(part(progress, begin / 100, done / 100), checkpoints)
+        for number, solved in enumerate(steps, 1):
+            with stage(f"table {number} of at most {len(steps)}"):
+                build = _Build(surface, solved, settings.polarised)
+                values, mueller = build.table(progress, checkpoints)
             spectrum = RigorousSpectrum(
                 axes=build.axes,
                 values=values,
@@ -130,10 +131,7 @@ def build_spectrum(
             spectrum = dataclasses.replace(spectrum, **_errors(spectrum, checks))
             # `polarisation_error` is NaN without matrices.
             if spectrum.error <= tolerance and not spectrum.polarisation_error > MAX_POLARISATION_ERROR * tolerance:
-                progress(100, 100)
                 return spectrum
-            error = spectrum.error
-    progress(100, 100)
     got, wanted = f"{spectrum.error:.2g}", f"{tolerance:.2g}"
     if settings.polarised:
         got += f" and {spectrum.polarisation_error:.2g} of the Mueller matrices"
@@ -330,11 +328,14 @@ class _Build:
         done = _Checkpoint(checkpoints, f"{self.surface.digest}-{max(self.steps)}")
         remaining = [job for job in range(len(self.jobs)) if job not in done.done]
         solve = self._job if self.transmits else self._planes
+        work = self.work()
+        finished = sum(work[job] for job in done.done)
         with ThreadPoolExecutor(os.cpu_count()) as pool:
             try:
                 for job, solved in zip(remaining, pool.map(solve, remaining), strict=True):
                     done.add(job, solved)
-                    progress(len(done.done), len(self.jobs))
+                    finished += work[job]
+                    progress(int(100 * finished / sum(work) + 1e-6), 100)
             except BaseException:
                 pool.shutdown(cancel_futures=True)
                 done.write()
@@ -343,48 +344,82 @@ class _Build:
         done.remove()
         return stored
 
-    def _job(self, job: int) -> NDArray[np.float32]:
-        """Return M at one a in one block, (incident, outgoing, X, Z, i, j); 0 at nodes that are not solved."""
+    def work(self) -> list[float]:
+        """Return about the work of each job, in eigenproblems, to foretell the time that is left.
+
+        A field that several jobs share counts in the first of them.
+        """
+        works, known = [], set[tuple[float, float, bool]]()
+        for job, (a, _) in enumerate(self.jobs):
+            if self.transmits:
+                pairs = {squares for *_, squares in self._pairs(job)}
+                fields = {
+                    (a, square, above) for pair in pairs for square, above in zip(pair, (True, False), strict=True)
+                }
+                works.append(len(fields - known) + _PAIR_WORK * len(pairs))
+                known |= fields
+            else:
+                counts = [len(self._wavelengths(square)[0]) for square in set(self._squares(job))]
+                works.append(len(counts) + (1 + _PAIR_WORK) * sum(counts))
+        return works
+
+    def _pairs(self, job: int) -> Iterator[tuple[int, int, tuple[float, float]]]:
+        """Return the indices along X and Z and (γ², γ'²) of each node of a job that is solved."""
         a, (above, below) = self.jobs[job]
-        axes, surface = self.axes, self.surface
-        counts = axes.counts(above, below)
+        axes = self.axes
         low, low_below = (float(interval_bounds(j, a, 0.0)[0]) for j in (above, below))
-        nodes = [len(fractions) for fractions in self.fractions[1:]]
-        found = np.zeros((sum(counts), sum(counts), *nodes, self.entries, self.entries))
-        # All nodes of an interval that shrinks to a point coincide.
-        known: dict[tuple[float, float], NDArray] = {}
         for (x, t_x), (z, t_z) in itertools.product(*(enumerate(fractions) for fractions in self.fractions[1:])):
             square = _square_in(above, a, t_x, low_below - axes.excess_limit)
             square_below = _square_in(below, a, t_z, low + axes.excess_limit)
             nu2 = (square_below - square) / axes.excess
             # Nodes outside the range of light are solved, too: without them the polynomials of their neighbours err.
-            if nu2 < max((axes.period / axes.wavelengths[1]) ** 2, square) / 64:
-                continue
-            key = square, square_below
-            if key not in known:
-                (solved,) = surface.solve(a, square, [(nu2, square_below)], fields=self.fields)
-                known[key] = self._matrices(solved, counts)
-            found[:, :, x, z] = known[key]
+            if nu2 >= max((axes.period / axes.wavelengths[1]) ** 2, square) / 64:
+                yield x, z, (square, square_below)
+
+    def _job(self, job: int) -> NDArray[np.float32]:
+        """Return M at one a in one block, (incident, outgoing, X, Z, i, j); 0 at nodes that are not solved."""
+        a, intervals = self.jobs[job]
+        counts = self.axes.counts(*intervals)
+        nodes = [len(fractions) for fractions in self.fractions[1:]]
+        found = np.zeros((sum(counts), sum(counts), *nodes, self.entries, self.entries))
+        # All nodes of an interval that shrinks to a point coincide.
+        known: dict[tuple[float, float], NDArray] = {}
+        for x, z, squares in self._pairs(job):
+            if squares not in known:
+                square, square_below = squares
+                nu2 = (square_below - square) / self.axes.excess
+                (solved,) = self.surface.solve(a, square, [(nu2, square_below)], fields=self.fields)
+                known[squares] = self._matrices(solved, counts)
+            found[:, :, x, z] = known[squares]
         return found.astype(np.float32)
+
+    def _squares(self, job: int) -> list[float]:
+        """Return γ² at the nodes along X of a job where Z is the wavelength."""
+        a, (above, _) = self.jobs[job]
+        return [_square_in(above, a, t_x, 0.0) for t_x in self.fractions[1]]
+
+    def _wavelengths(self, square: float) -> tuple[Real, Real]:
+        """Return the wavelengths that are solved for γ² = `square`, and the weights from these to the nodes."""
+        g = np.sqrt(square)
+        shortest, longest = self.axes.range(g)
+        count = 1
+        if longest > shortest:
+            counts = (count for limit, count in _SOLVED_WAVELENGTHS if g < limit * self.axes.max_nu)
+            count = next(counts, _SOLVED_WAVELENGTHS[-1][1])
+        at, weights = _nodes(count)
+        return shortest + at * (longest - shortest), weights
 
     def _planes(self, job: int) -> NDArray[np.float32]:
         """Return the result of `_job` where Z is the wavelength."""
         a, (above, _) = self.jobs[job]
-        axes, surface, planes = self.axes, self.surface, list[Any]()
-        squares = [_square_in(above, a, t_x, 0.0) for t_x in self.fractions[1]]
+        surface, planes, squares = self.surface, list[Any](), self._squares(job)
         for square, previous in zip(squares, [None, *squares], strict=False):
             if square == previous:
                 planes.append(planes[-1])
                 continue
-            g = np.sqrt(square)
-            shortest, longest = axes.range(g)
-            count = 1
-            if longest > shortest:
-                counts = (count for limit, count in _SOLVED_WAVELENGTHS if g < limit * axes.max_nu)
-                count = next(counts, _SOLVED_WAVELENGTHS[-1][1])
-            at, weights = _nodes(count)
-            lights = [surface.light(square, wavelength) for wavelength in shortest + at * (longest - shortest)]
-            solved = [self._matrices(found, axes.counts(above, 0)) for found in surface.solve(a, square, lights)]
+            wavelengths, weights = self._wavelengths(square)
+            lights = [surface.light(square, wavelength) for wavelength in wavelengths]
+            solved = [self._matrices(found, self.axes.counts(above, 0)) for found in surface.solve(a, square, lights)]
             planes.append(np.einsum("kw,wnm...->nmk...", weights, solved))
         return np.stack(planes, axis=2).astype(np.float32)
 

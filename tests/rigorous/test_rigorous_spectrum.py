@@ -269,10 +269,9 @@ def test_an_interrupted_build_resumes(tmp_path):
     assert not list(tmp_path.iterdir())
 
 
-def test_progress_in_per_cent_never_decreases(monkeypatch):
-    """Also if finer tables are needed."""
-    monkeypatch.setattr("mitsuba_diffraction.rigorous.build._SOLVED_STEPS", ((3, 3, 3), (4, 4, 4), (5, 5, 5)))
-    monkeypatch.setattr("mitsuba_diffraction.rigorous.build._CHECK_COUNT", 2)
+def test_progress_in_per_cent_begins_anew_with_a_finer_table(monkeypatch):
+    monkeypatch.setattr(build, "_SOLVED_STEPS", ((3, 3, 3), (4, 4, 4), (5, 5, 5)))
+    monkeypatch.setattr(build, "_CHECK_COUNT", 2)
     reports = []
     with pytest.warns(UserWarning, match="with 5 steps per interval"):
         build_spectrum(
@@ -281,10 +280,37 @@ def test_progress_in_per_cent_never_decreases(monkeypatch):
             progress=lambda done, total: reports.append((done, total)),
         )
     done, total = np.transpose(reports)
-    assert (np.diff(done) >= 0).all()
-    assert len(set(done)) > 10
     assert set(total) == {100}
-    assert done[-1] == 100
+    (ends,) = np.nonzero(done == 100)
+    tables = np.split(done, ends + 1)[:-1]
+    assert len(tables) == 3
+    for table in tables:
+        assert (np.diff(table) >= 0).all()
+        assert len(set(table)) > 3
+
+
+@pytest.mark.parametrize("transmission", ["none", "sheet", "interface"])
+def test_the_work_of_a_job_is_about_the_number_of_its_eigenproblems(transmission, monkeypatch):
+    """Jobs differ by a factor of five and more, so that equal steps of progress would mislead."""
+    solved = []
+
+    def counting(*arguments):
+        solved.append(arguments)
+        return fields(*arguments)
+
+    fields = build.half_space
+    monkeypatch.setattr(build, "half_space", counting)
+    monkeypatch.setattr(build._Surface.solve, "__defaults__", (0, counting))
+    monkeypatch.setattr(build, "_PAIR_WORK", 0)
+    surface = build._Surface(SURFACE, replace(REQUEST, transmission=transmission), 0.2)
+    jobs = build._Build(surface, (3, 4, 3), polarised=False)
+    work, counted = jobs.work(), []
+    for job in range(len(jobs.jobs)):
+        solved.clear()
+        (jobs._job if jobs.transmits else jobs._planes)(job)
+        counted.append(len(solved))
+    np.testing.assert_allclose(work, counted, rtol=0.25)
+    assert max(work) >= 5 * min(each for each in work if each)
 
 
 @pytest.mark.filterwarnings("ignore:rigorous table")  # of few steps
