@@ -15,8 +15,9 @@ from hypothesis import settings
 from threadpoolctl import threadpool_limits
 
 import mitsuba_diffraction as md  # before Dr.Jit, so that it has an LLVM that works
-from mitsuba_diffraction import cli, progress
+from mitsuba_diffraction import cli, progress, scalar_theory
 from mitsuba_diffraction.bsdf import shared
+from mitsuba_diffraction.energy.table import EnergyTable
 
 from bsdf_support import use  # isort: skip
 from mitsuba_diffraction.render import passes
@@ -74,6 +75,29 @@ def tables_of_a_module():
     """Share the tables of equal spectra among the tests of a module, which build a new BSDF each."""
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(shared, "_shared", {})
+        yield
+
+
+@pytest.fixture(scope="session", autouse=True)
+def results_of_a_session():
+    """Compute E of equal spectra and the solved error of equal profiles once: a third of the time of many tests."""
+    energy_of, solved_error, energies, errors = EnergyTable.of, scalar_theory._solved_error, {}, {}
+
+    def energy(spectrum, ratios=(1.0,), index=None, laterals=(1.0, 1.0)):
+        key = spectrum.digest, tuple(ratios), index, tuple(laterals)
+        if key not in energies:
+            energies[key] = energy_of(spectrum, ratios, index, laterals)
+        return energies[key]
+
+    def error(profile):
+        key = profile.heights[:1].tobytes(), profile.pixel_size
+        if key not in errors:
+            errors[key] = solved_error(profile)
+        return errors[key]
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(EnergyTable, "of", energy)
+        patch.setattr(scalar_theory, "_solved_error", error)
         yield
 
 

@@ -6,6 +6,7 @@ import signal
 import socket
 import subprocess
 import sys
+import threading
 import time
 from pathlib import Path
 
@@ -94,21 +95,31 @@ def test_a_cluster_gives_the_bits_of_one_machine(scene, processes, command):
 
 
 def test_results_that_arrive_out_of_order_are_added_in_order(threads_of_this_process, monkeypatch):
-    ended = []
+    ended, late, later_ended = [], [], threading.Event()
 
     def invented(scene, spp, seed, *others):
-        """Numbers whose sum depends on the order, after a while that is different for each pass."""
+        """Numbers whose sum depends on the order; a late pass ends after a later one."""
         rng = np.random.default_rng(seed)
-        time.sleep(rng.uniform(0, 0.1))
+        if seed in late:
+            assert later_ended.wait(60)
         ended.append(seed)
+        if late and in_order.index(seed) > in_order.index(late[0]):
+            later_ended.set()
         return (rng.normal(size=(SIZE, SIZE, 94)) * 10 ** rng.uniform(-9, 9)).astype(np.float32)
 
     monkeypatch.setattr(passes, "trace_pass", invented)
     local = render("scene.xml", spp=16)
     in_order = ended.copy()
     ended.clear()
-    monkeypatch.setattr(cluster, "pass_lock", contextlib.nullcontext())
-    remote = render("scene.xml", spp=16, tracer=trace_on(threads_of_this_process))
+    # The third: two sums in either order are equal.
+    late.append(in_order[2])
+    # Without the lock, two threads would load a scene and set the number of threads at once.
+    dr.set_thread_count(1)
+    with monkeypatch.context() as only_here:
+        only_here.setattr(cluster, "pass_lock", contextlib.nullcontext())
+        only_here.setattr(cluster, "scene_of", lambda job: None)
+        only_here.setattr(cluster, "light_of", lambda job: None)
+        remote = render("scene.xml", spp=16, tracer=trace_on(threads_of_this_process))
     assert sorted(ended) == sorted(in_order)
     assert ended != in_order
     np.testing.assert_array_equal(remote.radiance, local.radiance)
