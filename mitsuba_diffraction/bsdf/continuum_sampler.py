@@ -71,7 +71,7 @@ class BinSampler:
 
     with A_jnm the mean power, in a bin of κ (`KappaBins`), of the bin in row n and column m, |q_x − mΔ_x| ≤ Δ_x/2 and
     |q_y − nΔ_y| ≤ Δ_y/2. M_j is their sum. Of lines and ridges, whose q is spread along one axis, much light may be
-    evanescent: only the rows that meet the disc are drawn and summed. Rows lie across the axis of the larger spread.
+    evanescent: only the rows that meet the disc are drawn and summed; they lie across this axis.
 
     A bin is drawn by two binary searches, for its row and for its block of columns; the density at a given q reads two
     words, of lines and ridges two packets more.
@@ -87,8 +87,9 @@ class BinSampler:
             axis.spacing * np.sqrt(np.average(np.arange(-axis.max_index, axis.max_index + 1) ** 2, weights=weights))
             for axis, weights in ((along_x, powers.sum((0, 2))), (along_y, powers.sum((1, 2))))
         )
-        self.is_line = min(spread_x, spread_y) < MAX_LINE_WIDTH * max(spread_x, spread_y)
-        self.transposed = spread_x > spread_y
+        self.is_line = bool(min(spread_x, spread_y) < MAX_LINE_WIDTH * max(spread_x, spread_y))
+        # All other surfaces have the same kernel.
+        self.transposed = self.is_line and bool(spread_x > spread_y)
         if self.transposed:
             powers, along_x, along_y = powers.swapaxes(0, 1), along_y, along_x
         powers = np.pad(powers, ((0, 0), (0, -powers.shape[1] % BLOCK), (0, 0)))
