@@ -80,7 +80,7 @@ def tables_of_a_module():
 
 @pytest.fixture(scope="session", autouse=True)
 def results_of_a_session():
-    """Compute E of equal spectra and the solved error of equal profiles once: a third of the time of many tests."""
+    """Compute E of equal spectra and the solved error of equal profiles once."""
     energy_of, solved_error, energies, errors = EnergyTable.of, scalar_theory._solved_error, {}, {}
 
     def energy(spectrum, ratios=(1.0,), index=None, laterals=(1.0, 1.0)):
