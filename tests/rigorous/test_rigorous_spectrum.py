@@ -290,12 +290,14 @@ def test_progress_in_per_cent_begins_anew_with_a_finer_table(monkeypatch):
 
 
 @pytest.mark.parametrize("transmission", ["none", "sheet", "interface"])
-def test_the_work_of_a_job_is_about_the_number_of_its_eigenproblems(transmission, monkeypatch):
+def test_the_work_of_a_job_is_the_number_of_its_eigenproblems(transmission, monkeypatch):
     """Jobs differ by a factor of five and more, so that equal steps of progress would mislead."""
     solved = []
 
     def counting(*arguments):
-        solved.append(arguments)
+        # Harmonics that are raised where energy is not conserved cannot be foreseen.
+        if arguments[0] is surface.gratings[0]:
+            solved.append(arguments)
         return fields(*arguments)
 
     fields = build.half_space
@@ -309,7 +311,7 @@ def test_the_work_of_a_job_is_about_the_number_of_its_eigenproblems(transmission
         solved.clear()
         (jobs._job if jobs.transmits else jobs._planes)(job)
         counted.append(len(solved))
-    np.testing.assert_allclose(work, counted, rtol=0.25)
+    assert work == counted
     assert max(work) >= 5 * min(each for each in work if each)
 
 
