@@ -1,9 +1,9 @@
 """A sampler of q for smooth spectra and for orders that overlap, from a table of bins.
 
 With s = k_i,∥, light diffracted at the frequency q propagates if |λq + s| ≤ n_o: q lies in the disc of the radius
-r = n_o/λ around c = −s/λ. A q that is drawn outside of it is replaced by its inversion in the circle,
-c + r² (q − c)/|q − c|²: for any medium and any incident direction every sample propagates, and no sum over the disc is
-needed.
+n_o/λ around c = −s/λ. A q that is drawn outside of it is replaced by its inversion in the circle of the horizon,
+c + (n_o/λ)² (q − c)/|q − c|²: for any medium and any incident direction every sample propagates, and no sum over the
+disc is needed.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ MAX_BIN_WIDTH = 2.0  # in σ_q
 MAX_BIN_SPACING = 0.06  # cycles/µm, where lobes are wide
 BLOCK = 4  # columns of bins; tables of the sums of all columns would be slow to search
 MAX_LINE_WIDTH = 0.25  # standard deviation of q across lines and ridges, relative to that along the axis
-MAX_RATIO = 1e6  # r²/|q − c|², above which the inversion of q lies outside of all tables
+MAX_RATIO = 1e6  # (n_o/λ)²/|q − c|², above which the inversion of q lies outside of all tables
 LOBE_CUTOFF = 4.0  # of the lobes of orders, in σ_q
 
 
@@ -67,7 +67,7 @@ class BinAxis:
 class BinSampler:
     """The density of q in the disc of propagating light, f(q) of the table and that of its inversion q′ in the circle:
 
-        p(q) = f(q) + f(q′) r⁴/|q − c|⁴,    f(q) = Σ_j w_j A_jnm/M_j / (Δ_x Δ_y)
+        p(q) = f(q) + f(q′) (n_o/λ)⁴/|q − c|⁴,    f(q) = Σ_j w_j A_jnm/M_j / (Δ_x Δ_y)
 
     with A_jnm the mean power, in a bin of κ (`KappaBins`), of the bin in row n and column m, |q_x − mΔ_x| ≤ Δ_x/2 and
     |q_y − nΔ_y| ≤ Δ_y/2. M_j is their sum. Of lines and ridges, whose q is spread along one axis, much light may be
@@ -164,7 +164,7 @@ class BinSampler:
 
 
 def _inverted(q: mi.Vector2f, centre: mi.Vector2f, radius: mi.Float) -> tuple[mi.Vector2f, mi.Float]:
-    """Return the inversion of q in a circle, c + (q − c) r²/|q − c|², and r²/|q − c|²."""
+    """Return the inversion of q in a circle of radius ρ around c, c + (q − c) ρ²/|q − c|², and ρ²/|q − c|²."""
     from_centre = q - centre
     ratio = dr.square(radius) / larger(dr.squared_norm(from_centre), 1e-12)
     return dr.fma(ratio, from_centre, centre), ratio

@@ -329,13 +329,14 @@ class _Build:
         remaining = [job for job in range(len(self.jobs)) if job not in done.done]
         solve = self._job if self.transmits else self._planes
         work = self.work()
+        total = sum(work)
         finished = sum(work[job] for job in done.done)
         with ThreadPoolExecutor(os.cpu_count()) as pool:
             try:
                 for job, solved in zip(remaining, pool.map(solve, remaining), strict=True):
                     done.add(job, solved)
                     finished += work[job]
-                    progress(int(100 * finished / sum(work) + 1e-6), 100)
+                    progress(int(100 * finished / total + 1e-6), 100)
             except BaseException:
                 pool.shutdown(cancel_futures=True)
                 done.write()
