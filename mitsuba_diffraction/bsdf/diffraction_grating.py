@@ -50,7 +50,6 @@ PARAMETERS = (
         "string",
         'a conductor instead, as in Mitsuba\'s `conductor`, or Ti; "none" is the perfect mirror, R = 1',
     ),
-    Parameter("fresnel", "string", "exact, or Schlick's approximation schlick", "exact"),
     Parameter(
         "thin_film_thickness",
         "float, texture or string",
@@ -132,7 +131,7 @@ Under a coat (`coat.py`) all this holds for the wavelengths and directions insid
 specularly. A saved spectrum must cover the shorter wavelengths inside; one built from a recipe or a profile does.
 
 In polarised variants, scalar theory polarises as a plane perpendicular to the half vector does; rigorous theory uses
-the Mueller matrices of the orders. A perfect mirror and Schlick's formula depolarise.
+the Mueller matrices of the orders. A perfect mirror depolarises.
 """
 
 

@@ -16,8 +16,6 @@ from ..settings import VISIBLE
 from .base import nested_plugin
 from .coat import MAX_INDEX, MIN_INDEX, Coat, absolute_index
 
-MODELS = ("exact", "schlick")
-
 
 class Material:
     """The reflectance of a material, from `__call__` or `powers`; by default it has no index and no parameters.
@@ -25,7 +23,6 @@ class Material:
     Attributes:
         transparent: whether transmitted light is not absorbed.
         wavelengths: range in which the reflectance is known, nm.
-        model: one of `MODELS`.
         eta: relative index of refraction, a mi.Float; of a metal its real part, a mi.Texture; else None.
         outside: absolute index of the medium above, to which indices are relative.
         varies: whether the material varies over the surface.
@@ -33,7 +30,6 @@ class Material:
 
     transparent: bool = False
     wavelengths: tuple[float, float] = (0.0, np.inf)
-    model: str = "exact"
     eta: Any = None
     outside: float = 1.0
     varies: bool = False
@@ -58,7 +54,7 @@ class Material:
     ) -> list[mi.Matrix4f]:
         """Return the Mueller matrices of a plane between its s axes at each wavelength, up to a factor.
 
-        A material without polarisation, such as Schlick's formula, depolarises.
+        A perfect mirror, which has no index, depolarises.
         """
         depolariser = mi.Matrix4f(0)
         depolariser[0, 0] = mi.Float(1.0)
@@ -72,17 +68,14 @@ class Material:
 
 
 def reflectance_from(props: mi.Properties, coat: Coat | None) -> Material:
-    """Return the material given by `int_ior`, `ext_ior`, `material` and `fresnel`, relative to a coat if there is one.
+    """Return the material given by `int_ior`, `ext_ior` and `material`, relative to a coat if there is one.
 
     Raises:
         RequestError: if they contradict each other or are unknown.
     """
-    model = props.get("fresnel", "exact")
-    if model not in MODELS:
-        raise RequestError(f"fresnel: got {model!r}, wanted one of {', '.join(MODELS)}")
     if "material" not in props:
         outside = props.get("ext_ior", "air")
-        return Dielectric(props.get("int_ior", 1.5), outside if coat is None else coat.index, model)
+        return Dielectric(props.get("int_ior", 1.5), outside if coat is None else coat.index)
     if "int_ior" in props or ("ext_ior" in props and "coat_ior" not in props):
         raise RequestError(
             "material: a conductor or a perfect mirror takes no int_ior or ext_ior; give one or the other"
@@ -94,7 +87,7 @@ def reflectance_from(props: mi.Properties, coat: Coat | None) -> Material:
         return PerfectMirror()
     # There is no coat if its index is that of the outside.
     outside = coat.index if coat is not None else absolute_index("ext_ior", props.get("ext_ior", 1.0))
-    return Conductor(material, model, outside)
+    return Conductor(material, outside)
 
 
 class PerfectMirror(Material):
@@ -115,10 +108,9 @@ class Dielectric(Material):
 
     transparent = True
 
-    def __init__(self, int_ior: float | str, ext_ior: float | str, model: str) -> None:
+    def __init__(self, int_ior: float | str, ext_ior: float | str) -> None:
         self.outside = absolute_index("ext_ior", ext_ior)
         self.eta = mi.Float(absolute_index("int_ior", int_ior) / self.outside)
-        self.model = model
         self.update()
 
     def update(self) -> None:
@@ -135,9 +127,7 @@ class Dielectric(Material):
             )
 
     def __call__(self, si: mi.SurfaceInteraction3f, cos_half: mi.Float, active: mi.Bool) -> mi.UnpolarizedSpectrum:
-        if self.model == "exact":
-            return mi.UnpolarizedSpectrum(mi.fresnel(cos_half, self.eta)[0])
-        return mi.UnpolarizedSpectrum(_schlick(dr.square((self.eta - 1) / (self.eta + 1)), cos_half))
+        return mi.UnpolarizedSpectrum(mi.fresnel(cos_half, self.eta)[0])
 
     def index(self, si: mi.SurfaceInteraction3f, active: mi.Bool) -> list[mi.Complex2f]:
         return [mi.Complex2f(self.eta, 0)] * len(si.wavelengths)
@@ -145,8 +135,6 @@ class Dielectric(Material):
     def planes(
         self, si: mi.SurfaceInteraction3f, cos_half: mi.Float, reflects: mi.Bool, active: mi.Bool
     ) -> list[mi.Matrix4f]:
-        if self.model == "schlick":
-            return super().planes(si, cos_half, reflects, active)
         cos, eta = dr.abs(cos_half), dr.select(cos_half > 0, self.eta, dr.rcp(self.eta))
         reflection = mi.mueller.specular_reflection(cos, mi.Complex2f(eta, 0))
         return [dr.select(reflects, reflection, mi.mueller.specular_transmission(cos, eta))] * len(si.wavelengths)
@@ -155,13 +143,13 @@ class Dielectric(Material):
         callback.put("eta", self.eta, mi.ParamFlags.Differentiable)
 
     def __repr__(self) -> str:
-        return f"dielectric, eta = {self.eta}, {self.model}"
+        return f"dielectric, eta = {self.eta}"
 
 
 class Conductor(Material):
     """A metal of index η + ik, named as in Mitsuba's `conductor`; under a coat, relative to the index of the coat."""
 
-    def __init__(self, material: str, model: str, outside: float) -> None:
+    def __init__(self, material: str, outside: float) -> None:
         data = Path(str(mi.file_resolver().resolve("data/ior/Al.eta.spd"))).parent
         try:
             wavelengths, *index = conductor(material, data)
@@ -173,7 +161,7 @@ class Conductor(Material):
         )
         self.wavelengths = float(grid[0]), float(grid[-1])
         self.eta, self.k = (self._spectrum(grid, np.interp(grid * 1e-3, wavelengths, n) / outside) for n in index)
-        self.material, self.model, self.outside = material, model, outside
+        self.material, self.outside = material, outside
 
     @staticmethod
     def _spectrum(grid: NDArray[np.float64], values: NDArray[np.float64]) -> mi.Texture:
@@ -183,11 +171,7 @@ class Conductor(Material):
         return nested_plugin("regular", wavelength_min=float(grid[0]), wavelength_max=float(grid[-1]), values=text)
 
     def __call__(self, si: mi.SurfaceInteraction3f, cos_half: mi.Float, active: mi.Bool) -> mi.UnpolarizedSpectrum:
-        if self.model == "exact":
-            return mi.UnpolarizedSpectrum([mi.fresnel_conductor(cos_half, n) for n in self.index(si, active)])
-        eta, k = self.eta.eval(si, active), self.k.eval(si, active)
-        normal = (dr.square(eta - 1) + dr.square(k)) / (dr.square(eta + 1) + dr.square(k))
-        return _schlick(normal, cos_half)
+        return mi.UnpolarizedSpectrum([mi.fresnel_conductor(cos_half, n) for n in self.index(si, active)])
 
     def index(self, si: mi.SurfaceInteraction3f, active: mi.Bool) -> list[mi.Complex2f]:
         eta, k = self.eta.eval(si, active), self.k.eval(si, active)
@@ -196,8 +180,6 @@ class Conductor(Material):
     def planes(
         self, si: mi.SurfaceInteraction3f, cos_half: mi.Float, reflects: mi.Bool, active: mi.Bool
     ) -> list[mi.Matrix4f]:
-        if self.model == "schlick":
-            return super().planes(si, cos_half, reflects, active)
         return [mi.mueller.specular_reflection(cos_half, n) for n in self.index(si, active)]
 
     def traverse(self, callback: mi.TraversalCallback) -> None:
@@ -205,10 +187,4 @@ class Conductor(Material):
         callback.put("k", self.k, mi.ParamFlags.Differentiable)
 
     def __repr__(self) -> str:
-        return f"conductor, {self.material}, {self.model}"
-
-
-def _schlick(normal: mi.UnpolarizedSpectrum, cos_half: mi.Float) -> mi.UnpolarizedSpectrum:
-    """Return R₀ + (1 − R₀)(1 − cos)⁵ (Schlick 1994), R₀ the power reflectance at normal incidence."""
-    complement = 1 - cos_half
-    return normal + (1 - normal) * dr.square(dr.square(complement)) * complement
+        return f"conductor, {self.material}"

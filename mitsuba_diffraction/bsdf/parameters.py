@@ -34,7 +34,6 @@ _SCALAR_ONLY = {
     "lateral_scale": "build the spectrum of the other period",
     "base": "transmitted light is not computed; leave it out",
     "shadowing": "it is part of the efficiencies; leave it out",
-    "fresnel": "it is part of the efficiencies; leave it out",
     "thin_film_thickness": "its tables are of bare surfaces; leave it out",
     "thin_film_ior": "its tables are of bare surfaces; leave it out",
 }
@@ -410,8 +409,6 @@ class GratingRequest:
         check_texture("orientation", orientation)
         surface = surface_from(props, media, scales.max_scale)
         material = with_film(props, reflectance_from(props, media.coat))
-        if media.eta is not None and material.model == "schlick":
-            raise RequestError("fresnel: got 'schlick' with a transmission, wanted 'exact'")
         if "base" in props and not material.transparent:
             raise RequestError("base: got a BSDF below a conductor or a perfect mirror, which transmit no light")
         shadowing = props.get("shadowing", SHADOWING[0])

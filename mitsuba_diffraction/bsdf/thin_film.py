@@ -101,8 +101,6 @@ def with_film(props: mi.Properties, material: Material) -> Material:
         raise RequestError(f"{given[0]}: got it alone, wanted thin_film_thickness and thin_film_ior together")
     if isinstance(material, PerfectMirror):
         raise RequestError("thin_film_thickness: got a film on material=none, wanted a dielectric or a conductor")
-    if material.model != "exact":
-        raise RequestError(f"fresnel: got {material.model!r} with a thin film, wanted 'exact'")
     film = _of_index(props["thin_film_ior"], material.outside)
     return FilmedMaterial(material, film, VaryingNumber(props, "thin_film_thickness", 0.0))
 
@@ -110,12 +108,12 @@ def with_film(props: mi.Properties, material: Material) -> Material:
 def _of_index(ior: float | str, outside: float) -> Material:
     """Return the material of a film, for its index relative to the outside."""
     try:
-        return Dielectric(absolute_index("thin_film_ior", ior), outside, "exact")
+        return Dielectric(absolute_index("thin_film_ior", ior), outside)
     except RequestError:
         if not isinstance(ior, str):
             raise
     try:
-        return Conductor(ior, "exact", outside)
+        return Conductor(ior, outside)
     except RequestError as error:
         reason = str(error).partition("; ")[0].replace("material: ", "thin_film_ior: ")
         raise RequestError(f"{reason}, a number, or a name as for int_ior") from None

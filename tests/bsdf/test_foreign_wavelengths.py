@@ -12,7 +12,7 @@ DIFFUSE = {"type": "diffuse", "reflectance": {"type": "rgb", "value": [0.1, 0.4,
 GRATINGS = {
     "line": lambda: {**BLAZE, "material": "Al"},
     "coat": lambda: {**BLAZE, "material": "Al", "coat_ior": 1.5},
-    "crossed": lambda: of_spectrum(spectrum("corner"), material="Cu", fresnel="schlick"),
+    "crossed": lambda: of_spectrum(spectrum("corner"), material="Cu"),
     "sample": lambda: of_spectrum(
         md.precompute(md.gratings.elaphe(8), extent="sample", coherence_length=1.5),
         material="Al",

@@ -177,7 +177,6 @@ def test_files_recipes_and_profiles_have_equal_values(llvm, solved, recipe_file,
     [
         ({"height_scale": 0.5}, "height_scale: got 0.5, wanted none with theory=rigorous: build the spectrum"),
         ({"shadowing": "none"}, "shadowing: got 'none', wanted none with theory=rigorous"),
-        ({"fresnel": "exact"}, "fresnel: got 'exact', wanted none with theory=rigorous"),
         ({"base": {"type": "diffuse"}}, "base: got a BSDF, wanted none with theory=rigorous"),
         ({"material": "Al"}, "got material Al, but the rigorous spectrum is of int_ior 1.5"),
         ({"int_ior": 1.6}, "got int_ior 1.59956, but the rigorous spectrum is of int_ior 1.5"),

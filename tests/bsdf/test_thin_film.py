@@ -258,7 +258,6 @@ WRONG = [
     ({"thin_film_thickness": float("nan")}, "thin_film_thickness: got nan, wanted a number"),
     ({"thin_film_thickness": 3.0}, "thin_film_thickness: got 3, wanted 0 to 2 um; a thicker layer is a coat"),
     ({"material": "none"}, "thin_film_thickness: got a film on material=none"),
-    ({"fresnel": "schlick"}, "fresnel: got 'schlick' with a thin film, wanted 'exact'"),
     ({"thin_film_ior": "zinc"}, "thin_film_ior: got 'zinc', wanted one of"),
     ({"thin_film_ior": "titanium"}, "thin_film_ior: got 'titanium', did you mean Ti"),
     ({"thin_film_ior": -1.0}, "thin_film_ior: got -1.0, wanted a positive index"),

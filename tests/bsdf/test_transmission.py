@@ -347,7 +347,6 @@ def test_the_flat_face_of_a_sheet_is_a_mirror():
         ({"transmission": "sheet", "int_ior": 1.5, "coat_ior": 1.4}, "coat_ior: got 1.4"),
         ({"transmission": "interface", "base": {"type": "diffuse"}}, "base: got a BSDF"),
         ({"transmission": "interface", "int_ior": 1.33, "ext_ior": 1.33}, "int_ior: got that of the outside"),
-        ({"transmission": "interface", "fresnel": "schlick"}, "fresnel: got 'schlick'"),
     ],
 )
 def test_opaque_materials_and_layers_are_refused(parameters, named):

@@ -24,7 +24,7 @@ from mitsuba_diffraction.render.scene import channel_wavelengths, channel_weight
 # A sphere above a plate, with a pigment; broad lobes, so that small pictures resolve them.
 GRATING = """<bsdf type="diffraction_grating"><string name="profile" value="{profile}"/>
 <float name="period" value="{period}"/><float name="depth" value="0.2"/><integer name="samples" value="64"/>
-<float name="coherence_length" value="{coherence}"/><string name="fresnel" value="schlick"/>{base}</bsdf>"""
+<float name="coherence_length" value="{coherence}"/>{base}</bsdf>"""
 BASE = '<bsdf name="base" type="diffuse"><spectrum name="reflectance" value="0.05"/></bsdf>'
 SUN = """<emitter type="directional"><vector name="direction" x="-0.3" y="0.2" z="-1"/>
 <spectrum name="irradiance" type="d65"/></emitter>"""

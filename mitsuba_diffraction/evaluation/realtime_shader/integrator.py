@@ -121,7 +121,7 @@ def define() -> type:
             if self.variant != "gem":
                 settings["corrected_coherence_length"] = float(recipe.settings.coherence_length)
                 material = layers.grating.theory.material
-                settings["exact_fresnel"] = isinstance(material, Dielectric) and material.model == "exact"
+                settings["exact_fresnel"] = isinstance(material, Dielectric)
                 settings["extent"] = recipe.settings.extent
                 settings["max_height_scale"] = float(layers.grating.scales.height.values[-1])
             shader = VARIANTS[self.variant](recipe.height_field(), self.quirks, **settings)
