@@ -38,7 +38,7 @@ class Case:
         with warnings.catch_warnings():
             # The warnings of coarse pixels and of few terms do not matter here.
             warnings.simplefilter("ignore", UserWarning)
-            return precompute(
+            found = precompute(
                 self.height_field,
                 extent=self.extent,
                 coherence_length=self.coherence_length,
@@ -46,6 +46,8 @@ class Case:
                 representation=representation,
                 terms=terms,
             )
+        assert isinstance(found, GratingSpectrum)
+        return found
 
 
 def bundled_cases() -> list[Case]:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 from collections.abc import Sequence
 from dataclasses import dataclass
 
@@ -96,7 +97,7 @@ def measure(
 
 def _wavelengths(shift: ArrayLike) -> NDArray[np.float64]:
     """Return equally spaced wavelengths as Mitsuba's path tracer draws them: (..., 4) nm from shifts (..., 1)."""
-    return VISIBLE[0] + (VISIBLE[1] - VISIBLE[0]) * (shift + np.arange(4)) / 4
+    return VISIBLE[0] + (VISIBLE[1] - VISIBLE[0]) * (np.asarray(shift, np.float64) + np.arange(4)) / 4
 
 
 def _fraction(bsdf: mi.BSDF, angle: float, count: int) -> tuple[float, float]:
@@ -130,7 +131,8 @@ def _against_cosine(bsdf: mi.BSDF, angle: float, count: int, repetitions: int) -
         return value / mi.warp.square_to_cosine_hemisphere_pdf(wo)
 
     samplers = {"cosine": cosine, "own": own}
-    times = seconds({name: lambda draw=draw: dr.eval(draw()) for name, draw in samplers.items()}, repetitions)
+    work = {name: functools.partial(lambda draw: dr.eval(draw()), draw) for name, draw in samplers.items()}
+    times = seconds(work, repetitions)
     costs = {name: np.array(draw(), np.float64).var() * times[name] for name, draw in samplers.items()}
     return float(costs["cosine"] / costs["own"])
 

@@ -23,8 +23,9 @@ from ...progress import Progress, silent, table
 from ...reference import order_powers
 from ...settings import ORIGINS, SERIES, VISIBLE
 from ...spectrum.grids import OrderGrid
-from ...spectrum.tables import AmplitudeTable, series_function, series_weights
+from ...spectrum.tables import AmplitudeTable, SliceTable, series_function, series_weights
 from ..plots import figure
+from ..realtime_shader.base import TextureShader
 from ..realtime_shader.flss import FLSS
 from ..report import cells
 from .accuracy import Exact
@@ -246,10 +247,10 @@ def methods(
             case.name,
             name,
             terms,
-            terms or spectrum.table.intervals * spectrum.table.terms,
+            _transforms(spectrum),
             4 * int(np.prod(spectrum.neighbours)) * spectrum.table.words_per_node,
             spectrum.megabytes,
-            found.get((name, terms), spectrum.error),
+            spectrum.error if terms is None else found[name, terms],
             exact.delta_e(spectrum),
             taken[name, terms] / count / unit,
         )
@@ -259,6 +260,7 @@ def methods(
         Method(case.name, _FFT, None, None, None, 0.0, None, (0.0, 0.0), 4 * taken[_FFT] / len(kappas) / unit)
     )
     for name, shader in shaders.items():
+        assert isinstance(shader, TextureShader)
         result.append(
             Method(
                 case.name,
@@ -273,6 +275,12 @@ def methods(
             )
         )
     return result
+
+
+def _transforms(spectrum: GratingSpectrum) -> int:
+    """Return the number of FFTs behind a table."""
+    table = spectrum.table
+    return table.values.shape[0] * table.values.shape[1] if isinstance(table, SliceTable) else len(table.terms)
 
 
 def affordable_transforms(fft: Method, evaluations: int) -> float:

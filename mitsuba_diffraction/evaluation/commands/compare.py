@@ -66,7 +66,7 @@ def compare(
 
     number = None if brightness == "auto" else checked_brightness(_number(brightness))
     parameters, name = scene_parameters(define), scene.stem
-    shader, *others = shader or ["flss"]
+    first, *others = shader or ["flss"]
     if scene.suffix.lower() == ".toml":
         parameters = {"spectrum": str(scene.resolve()), **parameters}
         scene = examples_folder() / "scenes" / "scan.xml"
@@ -78,7 +78,7 @@ def compare(
     if output is None or output.is_dir():
         folder = output or Path()
         prefix = folder / free_name(
-            f"{name}-{shader}", lambda stem: [folder / f"{stem}{end}" for end in (*_PICTURES, ".png")], reads
+            f"{name}-{first}", lambda stem: [folder / f"{stem}{end}" for end in (*_PICTURES, ".png")], reads
         )
     images = {f"{prefix}{end}": picture for end, picture in _PICTURES.items()}
     written = [("-o", Path(target)) for target in (*images, f"{prefix}.png")]
@@ -88,7 +88,7 @@ def compare(
     start = time.perf_counter()
     found = run(
         scene,
-        shader,
+        first,
         others=others,
         terms=terms,
         window=window,
@@ -110,7 +110,7 @@ def compare(
         summary.save_figure(found, files.enter_context(whole_file(f"{prefix}.png")))
         if json is not None:
             save_json(summary.as_dict(found), files.enter_context(whole_file(json)))
-    of_quirks = () if found.shares is None else (summary.quirk_table(found),)
+    of_quirks = () if found.shares is None else (summary.quirk_table(found.shares),)
     show(summary.picture_table(found), *of_quirks, width=120)
     tell("\n" + "\n".join(summary.notes(found)))
     tell(f"{', '.join(str(target) for _, target in written)}: {found.variant}, {time.perf_counter() - start:.1f} s")

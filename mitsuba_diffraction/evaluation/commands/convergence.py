@@ -57,7 +57,7 @@ def convergence(
     elif tolerance or reference_spp or len(spp or []) > 1:
         raise RequestError("--terms: got --tolerance, --reference-spp or several --spp, too; wanted at most one --spp")
     else:
-        counts = numbers("--terms", terms)
+        counts = [int(count) if count.is_integer() else count for count in numbers("--terms", terms).tolist()]
         own = {"representation": "auto", "terms": "auto", "heights_from": ORIGINS[0]}
     check_suffix("-o", plot, ".png")
     written = [("-o", plot), *([("--json", json)] if json is not None else [])]
@@ -94,7 +94,8 @@ def convergence(
             times = [found.overtaken(name, error) for error in ("delta_e", "relative_mse")]
             when = ["not overtaken" if math.isnan(time) else f"overtaken after {time:.2g} s" for time in times]
             tell(f"{name}: {when[0]} (ΔE00), {when[1]} (relative MSE)")
-    tell(f"the reference owes ΔE00 {found.noise:.2f} to noise")
+    if found.noise is not None:
+        tell(f"the reference owes ΔE00 {found.noise:.2f} to noise")
 
 
 def _report_series(found: SeriesStudy, plot: Path, json: Path | None) -> None:

@@ -38,6 +38,7 @@ def validate(
     """Check the BSDF against closed forms and rigorous results, or check one surface; fail if a bound is exceeded."""
     import mitsuba as mi
 
+    from ...grating_spectrum import GratingSpectrum
     from ...llvm import choose_variant
     from .. import report
     from ..validation.checks import checks, surface_checks
@@ -50,11 +51,16 @@ def validate(
         )
     chosen = choose_variant(variant)
     recipe = None if surface is None else _recipe(surface, of_scan, settings)
-    reads = [] if surface is None else [surface, *recipe.files]
+    reads = [] if surface is None or recipe is None else [surface, *recipe.files]
     writes = [(option, path) for option, path in (("--json", json), ("--markdown", markdown)) if path is not None]
     outputs.check_outputs(reads, writes, overwrite=overwrite)
     mi.set_variant(chosen)
-    these = checks() if recipe is None else surface_checks(recipe.height_field(), recipe.cached(progress_bar))
+    if recipe is None:
+        these = checks()
+    else:
+        spectrum = recipe.cached(progress_bar)
+        assert isinstance(spectrum, GratingSpectrum)  # `_recipe` refuses rigorous theory
+        these = surface_checks(recipe.height_field(), spectrum)
     results = []
     with progress_bar("validation") as progress:
         for check in these:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 import os
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import AbstractContextManager
@@ -148,9 +149,16 @@ def compare(
     for name in settings:
         if not any(name in settings_of(kind) for kind in (shader, *others)):
             raise RequestError(f"{name}: got {settings[name]!r}, which {', '.join((shader, *others))} cannot use")
-    request = {"seed": seed, "parameters": parameters, "settings": settings}
-    request |= {"brightness": brightness, "pigment": pigment}
-    of = Pictures(scene_path, shader, width=width, height=height, **request)
+    open_scene = functools.partial(
+        Pictures,
+        *(scene_path, shader),
+        seed=seed,
+        parameters=parameters,
+        settings=settings,
+        brightness=brightness,
+        pigment=pigment,
+    )
+    of = open_scene(width=width, height=height)
     for other in others:
         of.use(other)  # refuses a scene that it cannot show
     of.use(shader)
@@ -177,7 +185,7 @@ def compare(
     if shares:
         scale = min(1.0, shares_side / max(of.surface.shape))
         columns, rows = (max(1, round(size * scale)) for size in of.film_size)
-        small = Pictures(scene_path, shader, width=columns, height=rows, **request)
+        small = open_scene(width=columns, height=rows)
         with progress("quirks") as bar:
             of_quirks = quirk_shares(small, QUIRKS_SAMPLES, QUIRKS_SHADING_POINTS, bar)
     return Comparison(

@@ -65,13 +65,13 @@ class Convergence:
     Attributes:
         scene: file name and parameters.
         size: (width, height) in pixels.
-        noise: mean CIEDE2000 of the reference due to noise.
+        noise: mean CIEDE2000 of the reference due to noise; None for one sample per pixel.
         points: in the order of measurement.
     """
 
     scene: str
     size: tuple[int, int]
-    noise: float
+    noise: float | None
     points: tuple[Point, ...]
 
     def curves(self) -> dict[str, list[Point]]:

@@ -481,4 +481,4 @@ def _shows_gratings(scene: mi.Scene, outer: list[mi.BSDF]) -> NDArray[np.bool_]:
     for bsdf in outer:
         of_grating |= si.bsdf() == mi.BSDFPtr(bsdf)
     hit = np.array(si.is_valid() & of_grating).reshape(rows, 4, columns, 4)
-    return hit.all(axis=(1, 3))
+    return np.asarray(hit.all(axis=(1, 3)))

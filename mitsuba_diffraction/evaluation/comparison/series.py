@@ -106,7 +106,7 @@ class SeriesStudy:
 def study(
     scene_path: str | os.PathLike[str],
     *,
-    terms: Sequence[float] = TERMS,
+    terms: Sequence[int] = TERMS,
     origins: Sequence[str] = ORIGINS,
     samples: int = SAMPLES,
     width: int | None = None,
@@ -117,7 +117,7 @@ def study(
 
     Args:
         scene_path: an XML scene with the parameters `representation`, `terms` and `heights_from` of a grating.
-        terms: whole numbers of terms, ascending.
+        terms: numbers of terms, ascending.
         origins: levels of h = 0, among "mean" and "lowest".
         samples: per pixel.
         width: in pixels; default: that of the film.
@@ -130,7 +130,6 @@ def study(
     """
     own = {"representation": SERIES[0], **(parameters or {})}
     kind = own["representation"]
-    terms = [int(count) if float(count).is_integer() else count for count in terms]
     for origin, count in itertools.product(origins, terms):
         Settings(representation=kind, terms=count, heights_from=origin)
     wanted = [{"representation": "auto", "terms": "auto", "heights_from": "mean"}]

@@ -88,11 +88,11 @@ def picture_table(comparison: Comparison) -> Table:
     return table(("picture", *columns), rows)
 
 
-def quirk_table(comparison: Comparison) -> Table:
+def quirk_table(shares: QuirkShares) -> Table:
     """Return a table of the visible quirks, largest fraction first, for a terminal."""
     rows = []
-    for name in comparison.shares.visible():
-        one = comparison.shares.quirks[name]
+    for name in shares.visible():
+        one = shares.quirks[name]
         rows.append([name, CAUSES[name], f"{one.drop:+.2f}", f"{one.rise:+.2f}", f"{one.share:.0%}"])
     return table(("quirk", "cause", "drop", "rise", "share"), rows)
 

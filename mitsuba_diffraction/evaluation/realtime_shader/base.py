@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import copy
 from collections.abc import Callable
-from typing import ClassVar
+from typing import TYPE_CHECKING, ClassVar
 
 import drjit as dr
 import mitsuba as mi
@@ -19,6 +19,9 @@ from .quirks import Quirks
 from .taper import tapered
 from .taylor_textures import MAX_KAPPA, TaylorTextures, taylor_transforms, terms_for
 from .tristimulus import MIN_WAVELENGTH, PUBLISHED_R0, WAVELENGTH_COUNT, WAVELENGTH_STEP, SpectralWeights, rgb_matrix
+
+if TYPE_CHECKING:
+    from typing_extensions import Self
 
 SERIES_ERROR = 1e-4  # of the amplitudes, if the number of Taylor terms is not given
 
@@ -54,29 +57,35 @@ class Gain:
 
 
 class Shader:
-    """Base class of the shaders of a tile. Subclasses have a method `rgb`, as that of `TextureShader`.
+    """Base class of the shaders of a tile.
 
     Directions are unit vectors in the frame of the tile, z being the normal, and point away from the surface: ω_i to
     the light, ω_o to the viewer. An instance is bound to the Mitsuba variant in which it was made.
 
     Attributes:
         own_quirks: names of the quirks that affect this shader.
-        peak: S(0) of a flat surface, µm², the normalisation of the relative radiance.
-        texel_reads: maximum number of texels read for one shading point.
         brightness_unit: factor of the colour for a brightness of one.
     """
 
     own_quirks: ClassVar[tuple[str, ...]]
     brightness_unit: ClassVar[float] = 1.0
-    peak: float
-    texel_reads: int
 
     def __init__(self, height_field: HeightField, quirks: Quirks, shadowing: bool = True) -> None:
         self.tile_size = height_field.tile_size
         self.quirks = quirks
         self.shadowing = shadowing
 
-    def with_quirks(self, quirks: Quirks) -> Shader:
+    @property
+    def peak(self) -> float:
+        """S(0) of a flat surface, µm², the normalisation of the relative radiance."""
+        raise NotImplementedError
+
+    @property
+    def texel_reads(self) -> int:
+        """The maximum number of texels read for one shading point."""
+        raise NotImplementedError
+
+    def with_quirks(self, quirks: Quirks) -> Self:
         """Return the same shader with other quirks; tables are shared."""
         other = copy.copy(self)
         other.quirks = quirks
@@ -91,6 +100,25 @@ class Shader:
         """Return the `SpectralWeights` of a material and a light."""
         return SpectralWeights(self.quirks, self.peak, r_0, light)
 
+    def rgb(
+        self,
+        wi: mi.Vector3f,
+        wo: mi.Vector3f,
+        weights: SpectralWeights,
+        active: mi.Bool = True,
+        height_scale: mi.Float = 1.0,
+    ) -> mi.Color3f:
+        """Return linear RGB, before gamma.
+
+        Args:
+            wi: ω_i.
+            wo: ω_o.
+            weights: from `weights`.
+            active: mask.
+            height_scale: scales the heights.
+        """
+        raise NotImplementedError
+
 
 class TextureShader(Shader):
     """Shader that sums Taylor textures, wavelength by wavelength, into XYZ.
@@ -104,20 +132,14 @@ class TextureShader(Shader):
     Attributes:
         origin_at_centre: whether x = 0 is the centre of the tile (`taylor_transforms`).
         published_terms: number of Taylor terms of the published shader.
-        tapers: whether the heights are tapered (`taper.py`).
-        margin: texels read outside the frequencies that light reaches.
-        texels_per_term: texels read per Taylor term and wavelength.
     """
 
-    own_quirks = (
+    own_quirks: ClassVar[tuple[str, ...]] = (
         *("schlick", "fixed_index", "floor_anchor", "fixed_terms", "fixed_coherence"),
         *("d65_light", "relative", "cie_rgb_matrix"),
     )
     origin_at_centre: ClassVar[bool] = False
     published_terms: ClassVar[int]
-    tapers = False
-    margin: int
-    texels_per_term: int
 
     def __init__(
         self,
@@ -156,7 +178,7 @@ class TextureShader(Shader):
         self._textures: dict[tuple[int, tuple[float, float] | None], TaylorTextures] = {}
         self._bind()
 
-    def with_quirks(self, quirks: Quirks) -> TextureShader:
+    def with_quirks(self, quirks: Quirks) -> Self:
         other = super().with_quirks(quirks)
         other._bind()
         return other
@@ -180,6 +202,21 @@ class TextureShader(Shader):
         self.textures = self._textures[kind]
         matrix = rgb_matrix(cie_rgb_matrix=self.quirks.cie_rgb_matrix)
         self.matrix = [[opaque(float(entry)) for entry in row] for row in matrix]
+
+    @property
+    def tapers(self) -> bool:
+        """Whether the heights are tapered (`taper.py`)."""
+        return False
+
+    @property
+    def margin(self) -> int:
+        """Texels read outside the frequencies that light reaches."""
+        raise NotImplementedError
+
+    @property
+    def texels_per_term(self) -> int:
+        """Texels read per Taylor term and wavelength."""
+        raise NotImplementedError
 
     @property
     def has_free_scale(self) -> bool:
@@ -241,15 +278,6 @@ class TextureShader(Shader):
         active: mi.Bool = True,
         height_scale: mi.Float = 1.0,
     ) -> mi.Color3f:
-        """Return linear RGB, before gamma.
-
-        Args:
-            wi: ω_i.
-            wo: ω_o.
-            weights: from `weights`.
-            active: mask.
-            height_scale: scales the heights.
-        """
         gain = Gain(wi, wo, self.shadowing, mi.Bool(active))
         xyz = gain.factor * self.integral(gain, weights, mi.Float(height_scale))
         return mi.Color3f(*(sum(row[i] * xyz[i] for i in range(3)) for row in self.matrix))

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import mitsuba as mi
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -10,7 +12,7 @@ from ...errors import RequestError
 from ...llvm import is_supported
 from ...surface.heightfield import HeightField
 from ...testing import array, vectors
-from .base import Shader
+from .base import Shader, TextureShader
 from .flss import FLSS
 from .gem import GEM
 from .nmm import NMM
@@ -21,7 +23,7 @@ from .quirks import Quirks
 VARIANTS = {"flss": FLSS, "nmm": NMM, "pq": PQ, "nmm_pq": NMMPQ, "gem": GEM}
 
 
-def shader_for(height_field: HeightField, variant: str, quirks: Quirks, **settings: object) -> Shader:
+def shader_for(height_field: HeightField, variant: str, quirks: Quirks, **settings: Any) -> Shader:
     """Return the shader of a given name (`VARIANTS`) in the current Mitsuba variant.
 
     Raises:
@@ -41,7 +43,7 @@ def colour(
     *,
     variant: str = "flss",
     quirks: Quirks | None = None,
-    **settings: object,
+    **settings: Any,
 ) -> NDArray[np.float32]:
     """Compute the shader's colour of a tile with an index of 1.5 under D65.
 
@@ -72,7 +74,7 @@ def relative_radiance(
     *,
     variant: str = "flss",
     quirks: Quirks | None = None,
-    **settings: object,
+    **settings: Any,
 ) -> NDArray[np.float32]:
     """Compute ρ(λ), the radiance relative to a flat mirror at normal incidence (eq. 3.11), for an index of 1.5.
 
@@ -95,6 +97,7 @@ def relative_radiance(
     if variant == "gem":
         raise RequestError("variant: gem has no spectrum, only RGB")
     shader = shader_for(height_field, variant, quirks or Quirks.as_published(), **settings)
+    assert isinstance(shader, TextureShader)
     wavelengths = np.asarray(wavelengths, np.float32)
     wi, wo = (np.broadcast_to(omega, (*wavelengths.shape, 3)) if np.ndim(omega) == 1 else omega for omega in (wi, wo))
     wi, wo, shape = _directions(wi, wo)

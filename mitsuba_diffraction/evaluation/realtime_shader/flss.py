@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from typing import Any, ClassVar
 
 import drjit as dr
 import mitsuba as mi
@@ -32,11 +33,14 @@ class FLSS(TextureShader):
         sigmas: σ along x and y, in cycles/µm: σ_f, or, of a tapered scan, the smaller ones of `taper.py`.
     """
 
-    own_quirks = (*TextureShader.own_quirks, "complex_window_sum", "one_texel", "periodic_scan")
+    own_quirks: ClassVar[tuple[str, ...]] = (
+        *TextureShader.own_quirks,
+        *("complex_window_sum", "one_texel", "periodic_scan"),
+    )
     published_terms = 37
 
     def __init__(
-        self, height_field: HeightField, quirks: Quirks, *, window: str | None = None, **settings: object
+        self, height_field: HeightField, quirks: Quirks, *, window: str | None = None, **settings: Any
     ) -> None:
         """Set up the shader with the arguments of `TextureShader` and `window`.
 
@@ -62,8 +66,8 @@ class FLSS(TextureShader):
     @property
     def _spanning(self) -> tuple[int, int]:
         """Texels on each side that span 4σ, at least one."""
-        axes = zip(self.sigmas, self.tile_size, strict=True)
-        return tuple(max(1, int(np.ceil(2 * sigma * size - 0.5))) for sigma, size in axes)
+        x, y = (2 * sigma * size - 0.5 for sigma, size in zip(self.sigmas, self.tile_size, strict=True))
+        return max(1, int(np.ceil(x))), max(1, int(np.ceil(y)))
 
     @property
     def margin(self) -> int:

@@ -169,7 +169,12 @@ def define() -> type:
                         lit &= ~scene.ray_test(si.spawn_ray_to(ds.p), active)
                     direction = si.to_local(ds.d)
 
-                    def value(light: int | None, active: mi.Bool, at=si, wo=direction) -> mi.UnpolarizedSpectrum:
+                    def value(
+                        light: int | None,
+                        active: mi.Bool,
+                        at: mi.SurfaceInteraction3f = si,
+                        wo: mi.Vector3f = direction,
+                    ) -> mi.UnpolarizedSpectrum:
                         for shaded in self.shaded:
                             shaded.light = light
                         return mi.unpolarized_spectrum(bsdf.eval(mi.BSDFContext(), at, wo, active))

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from typing import ClassVar
 
 import drjit as dr
 import mitsuba as mi
@@ -33,7 +34,7 @@ class NMM(FLSS):
     along x and y, frequencies are in units of σ.
     """
 
-    own_quirks = (*FLSS.own_quirks, "no_jacobian")
+    own_quirks: ClassVar[tuple[str, ...]] = (*FLSS.own_quirks, "no_jacobian")
     published_terms = 31
 
     @property

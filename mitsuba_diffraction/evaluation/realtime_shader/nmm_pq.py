@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import ClassVar
+
 import drjit as dr
 import mitsuba as mi
 
@@ -32,7 +34,7 @@ class NMMPQ(PQ):
     tiles. Sums over orders are of powers, since cross terms of different orders are small for many tiles.
     """
 
-    own_quirks = (*PQ.own_quirks, "no_jacobian")
+    own_quirks: ClassVar[tuple[str, ...]] = (*PQ.own_quirks, "no_jacobian")
 
     @property
     def texel_reads(self) -> int:

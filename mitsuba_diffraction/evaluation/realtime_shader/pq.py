@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from typing import Any, ClassVar
 
 import drjit as dr
 import mitsuba as mi
@@ -84,7 +85,7 @@ class PQ(TextureShader):
     zero outside the Nyquist limit. The thesis sums n = 0 … N, i.e. N + 1 tiles (eq. 3.33).
     """
 
-    own_quirks = (*TextureShader.own_quirks, "wrong_product")
+    own_quirks: ClassVar[tuple[str, ...]] = (*TextureShader.own_quirks, "wrong_product")
     brightness_unit = 0.5  # on a body; 0.2 on a map of the BRDF
     origin_at_centre = True
     published_terms = 39
@@ -97,7 +98,7 @@ class PQ(TextureShader):
         tiles: tuple[int, int] | None = None,
         interpolation: str = "sinc",
         radius: int = 1,
-        **settings: object,
+        **settings: Any,
     ) -> None:
         """Set up the shader with the arguments of `TextureShader` and those below.
 
@@ -114,7 +115,8 @@ class PQ(TextureShader):
     @property
     def tiles(self) -> tuple[int, int]:
         """(P, Q)."""
-        return self._tiles or tuple(max(1, round(self.coherence_length / size)) for size in self.tile_size)
+        x, y = (self.coherence_length / size for size in self.tile_size)
+        return self._tiles or (max(1, round(x)), max(1, round(y)))
 
     @property
     def margin(self) -> int:

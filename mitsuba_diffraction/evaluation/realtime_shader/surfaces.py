@@ -163,8 +163,8 @@ def sum_along(
         si = scene.ray_intersect(ray, throughput > 0)
         hit = (throughput > 0) & si.is_valid()
         bsdf = si.bsdf()
-        sums = (total + throughput * value for total, value in zip(sums, at_hit(si, bsdf, hit), strict=True))
-        return si.spawn_ray(ray.d), throughput * behind(si, bsdf, hit), count + 1, *sums
+        added = (total + throughput * value for total, value in zip(sums, at_hit(si, bsdf, hit), strict=True))
+        return si.spawn_ray(ray.d), throughput * behind(si, bsdf, hit), count + 1, *added
 
     state = dr.while_loop(
         (si.spawn_ray(ray.d), behind(si, bsdf, hit), mi.UInt32(0), *sums),
