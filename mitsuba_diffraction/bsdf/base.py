@@ -29,26 +29,24 @@ def is_grating(bsdf: mi.BSDF) -> bool:
     return hasattr(bsdf, "layers")
 
 
-def contains_grating(bsdf: mi.BSDF) -> bool:
-    """Return whether a BSDF is a grating or one is nested in it."""
-    return is_grating(bsdf) or any(map(contains_grating, nested(bsdf)))
+def gratings_in(bsdf: mi.BSDF | None) -> list[mi.BSDF]:
+    """Return a BSDF, if it is a grating, and the gratings nested in it."""
+    if bsdf is None:
+        return []
+    return [bsdf] * is_grating(bsdf) + [grating for part in parts(bsdf, mi.BSDF) for grating in gratings_in(part)]
 
 
-def nested(bsdf: mi.BSDF) -> list[mi.BSDF]:
-    """Return the BSDFs nested in a BSDF, such as both of a `twosided`."""
+def parts(plugin: mi.Object, kind: type) -> list[Any]:
+    """Return the objects of a class that a plugin holds as parameters, such as both BSDFs of a `twosided`."""
+    found = []
 
-    class Children(mi.TraversalCallback):
-        def __init__(self) -> None:
-            mi.TraversalCallback.__init__(self)
-            self.found: list[mi.BSDF] = []
-
+    class Callback(mi.TraversalCallback):
         def put(self, name: str, value: object, *rest: object) -> None:
-            if isinstance(value, mi.BSDF):
-                self.found.append(value)
+            if isinstance(value, kind):
+                found.append(value)
 
-    callback = Children()
-    bsdf.traverse(callback)
-    return callback.found
+    plugin.traverse(Callback())
+    return found
 
 
 TRANSMITS = (

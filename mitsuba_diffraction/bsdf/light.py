@@ -9,7 +9,7 @@ import numpy as np
 from ..errors import RequestError
 from ..llvm import is_supported
 from ..settings import VISIBLE
-from .base import is_grating, nested
+from .base import gratings_in, parts
 
 STEP = 0.25  # nm, less than the width of a lamp's lines
 
@@ -37,7 +37,7 @@ def cover_light(scene: mi.Scene) -> None:
     """
     if not is_supported(mi.variant()):
         return
-    gratings = {id(bsdf): bsdf for shape in scene.shapes() for bsdf in _gratings_in(shape.bsdf())}
+    gratings = {id(bsdf): bsdf for shape in scene.shapes() for bsdf in gratings_in(shape.bsdf())}
     if not gratings or not scene.sensors():
         return
     ranges = [wavelengths_of(sensor.film()) for sensor in scene.sensors()]
@@ -51,33 +51,16 @@ def cover_light(scene: mi.Scene) -> None:
             bsdf.cover((shortest, longest))
 
 
-def _gratings_in(bsdf: mi.BSDF | None) -> list[mi.BSDF]:
-    """Return a BSDF, if it is a grating, and those nested in it."""
-    if bsdf is None:
-        return []
-    return [bsdf] * is_grating(bsdf) + [grating for inner in nested(bsdf) for grating in _gratings_in(inner)]
-
-
 def _emits(emitter: mi.Emitter, low: float, high: float) -> bool:
     """Return whether a light may emit between two wavelengths, nm; of one without a spectrum, whether they are visible.
 
     Samples of wavelengths do not answer this, as Mitsuba draws those of some spectra from a part of their range.
     """
 
-    class Spectra(mi.TraversalCallback):
-        def __init__(self) -> None:
-            mi.TraversalCallback.__init__(self)
-            self.found: list[mi.Texture] = []
-
-        def put(self, name: str, value: object, *rest: object) -> None:
-            if isinstance(value, mi.Texture):
-                self.found.append(value)
-
-    spectra = Spectra()
-    emitter.traverse(spectra)
-    if not spectra.found or any(spectrum.is_spatially_varying() for spectrum in spectra.found):
+    spectra = parts(emitter, mi.Texture)
+    if not spectra or any(spectrum.is_spatially_varying() for spectrum in spectra):
         return low < VISIBLE[1] and high > VISIBLE[0]
     wavelengths = np.arange(low + STEP / 2, high, STEP)
     si = dr.zeros(mi.SurfaceInteraction3f, wavelengths.size)
     si.wavelengths = type(si.wavelengths)(mi.Float(wavelengths.astype(np.float32)))
-    return any(bool(dr.any(spectrum.eval(si) > 0, axis=None)) for spectrum in spectra.found)
+    return any(bool(dr.any(spectrum.eval(si) > 0, axis=None)) for spectrum in spectra)

@@ -13,7 +13,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from ..bsdf.base import contains_grating, is_grating, nested
+from ..bsdf.base import gratings_in, is_grating, parts
 
 
 def ratio(a: mi.Float, b: mi.Float) -> mi.Float:
@@ -32,8 +32,7 @@ class Gratings:
     """
 
     def __init__(self, scene: mi.Scene) -> None:
-        surfaces = [(shape, shape.bsdf()) for shape in scene.shapes()]
-        areas = [(shape, _area(shape)) for shape, bsdf in surfaces if bsdf is not None and contains_grating(bsdf)]
+        areas = [(shape, _area(shape)) for shape in scene.shapes() if gratings_in(shape.bsdf())]
         areas = [(shape, area) for shape, area in areas if area > 0]
         self.shapes = [shape for shape, _ in areas]
         if not self.shapes:
@@ -92,7 +91,7 @@ def _area(shape: mi.Shape) -> float:
 
 def _is_grating_only(bsdf: mi.BSDF) -> bool:
     """Return whether a BSDF is a grating without `base`, or a `twosided` of such gratings."""
-    components = nested(bsdf)
+    components = parts(bsdf, mi.BSDF)
     if is_grating(bsdf):
         return not components
     return bsdf.class_name() == "TwoSidedBRDF" and all(map(_is_grating_only, components))

@@ -18,7 +18,7 @@ import mitsuba.parser
 import numpy as np
 from numpy.typing import NDArray
 
-from ..bsdf.base import is_grating
+from ..bsdf.base import gratings_in, is_grating
 from ..bsdf.diffraction_grating import check
 from ..bsdf.light import cover_light, wavelengths_of
 from ..errors import RequestError, root_cause
@@ -171,19 +171,12 @@ def _warn_of_unused_materials(
 
 
 def _warn_of_light_from_below(scene: mi.Scene) -> None:
-    """Log a warning for gratings without transmission that are seen or lit only from below, and therefore black.
-
-    Rays of the first sensor are traced, and one light is sampled from each point that they hit.
-    """
+    """Log a warning for gratings without transmission that are seen or lit only from below, and therefore black."""
     gratings = [shape for shape in scene.shapes() if is_grating(shape.bsdf())]
     opaque = [shape for shape in gratings if not shape.bsdf().layers.interface.transmits]
     if not opaque or not scene.sensors():
         return
-    sampler = mi.load_dict({"type": "independent"})
-    sampler.seed(0, _RAYS_OF_SENSOR)
-    ray, _ = scene.sensors()[0].sample_ray(0, sampler.next_1d(), sampler.next_2d(), sampler.next_2d())
-    si = scene.ray_intersect(mi.Ray3f(ray))
-    light, weight = scene.sample_emitter_direction(si, sampler.next_2d(), False, si.is_valid())
+    si, light, weight = _visible_points(scene)
     lit = dr.any(mi.unpolarized_spectrum(weight) != 0)
     seen_above, lit_above = si.wi.z > 0, lit & (mi.Frame3f.cos_theta(si.to_local(light.d)) > 0)
     for shape in opaque:
@@ -199,18 +192,22 @@ def _warn_of_light_from_below(scene: mi.Scene) -> None:
             )
 
 
-def max_plausible_luminance(scene: mi.Scene) -> float:
-    """Return a luminance that no pixel should exceed by noise: 10⁴ times that of the brightest light found.
-
-    Lights are found by rays of the first sensor, and sampled from the surfaces that these hit. Point and directional
-    lights have an irradiance E instead of a radiance L, and narrow lobes reflect up to some 10⁴ E: they count as
-    L = 10⁴ E. The result is infinite if no light is found.
-    """
+def _visible_points(scene: mi.Scene) -> tuple[mi.SurfaceInteraction3f, mi.DirectionSample3f, mi.Spectrum]:
+    """Trace rays of the first sensor, and draw a light for each point hit; return points, lights and weights."""
     sampler = mi.load_dict({"type": "independent"})
     sampler.seed(0, _RAYS_OF_SENSOR)
     ray, _ = scene.sensors()[0].sample_ray(0, sampler.next_1d(), sampler.next_2d(), sampler.next_2d())
     si = scene.ray_intersect(mi.Ray3f(ray))
-    light, weight = scene.sample_emitter_direction(si, sampler.next_2d(), False, si.is_valid())
+    return si, *scene.sample_emitter_direction(si, sampler.next_2d(), False, si.is_valid())
+
+
+def max_plausible_luminance(scene: mi.Scene) -> float:
+    """Return a luminance that no pixel should exceed by noise: 10⁴ times that of the brightest light found.
+
+    Point and directional lights have an irradiance E instead of a radiance L, and narrow lobes reflect up to some
+    10⁴ E: they count as L = 10⁴ E. The result is infinite if no light is found.
+    """
+    si, light, weight = _visible_points(scene)
     sampled = mi.unpolarized_spectrum(weight) * light.pdf * dr.select(light.delta, _MAX_LOBE_VALUE, 1)
     seen = mi.unpolarized_spectrum(si.emitter(scene).eval(si))
     found = np.concatenate([np.ravel(values) for values in (*sampled, *seen)])
@@ -221,7 +218,7 @@ def max_plausible_luminance(scene: mi.Scene) -> float:
 def _warn_of_missing_uvs(scene: mi.Scene) -> None:
     """Log a warning if gratings are on meshes without texture coordinates; named by BSDF, as merged meshes lose ids."""
     bsdfs = [shape.bsdf() for shape in scene.shapes() if shape.is_mesh() and not has_uvs(shape)]
-    if names := sorted({bsdf.id() or "a BSDF" for bsdf in bsdfs if "DiffractionGrating[" in str(bsdf)}):
+    if names := sorted({bsdf.id() or "a BSDF" for bsdf in bsdfs if gratings_in(bsdf)}):
         _log.warning(
             "%s: on a mesh without UVs, where the direction of the grating differs from triangle to triangle; "
             "wanted a mesh with UVs",
@@ -283,22 +280,24 @@ def _emission(emitter: mi.Emitter, grid: NDArray[np.float64]) -> NDArray[np.floa
 def named_sample_count(path: str | os.PathLike[str], parameters: Mapping[str, str] | None = None) -> int | None:
     """Return the sample_count of the sampler of a scene's first sensor, None if unspecified; errors as of `parsed`."""
     with parsed(path, parameters) as (_, state):
-        sensor = next((node for node in state.nodes if node.type == mi.ObjectType.Sensor), None)
-        for sampler in _children(state, sensor.props, mi.ObjectType.Sampler) if sensor else ():
-            if (count := state.nodes[sampler].props.get("sample_count")) is not None:
-                if count < 1:
-                    raise RequestError(f"sample_count: got {count}, wanted a positive number of samples")
-                return int(count)
-    return None
+        counts = [sampler.get("sample_count") for sampler in _of_first_sensor(state, mi.ObjectType.Sampler)]
+        count = next((count for count in counts if count is not None), None)
+        if count is not None and count < 1:
+            raise RequestError(f"sample_count: got {count}, wanted a positive number of samples")
+    return count
 
 
 def has_alpha(path: str | os.PathLike[str], parameters: Mapping[str, str] | None = None) -> bool:
     """Return whether the film of a scene's first sensor has a `pixel_format` with alpha; errors as of `parsed`."""
     with parsed(path, parameters) as (_, state):
-        sensor = next((node for node in state.nodes if node.type == mi.ObjectType.Sensor), None)
-        films = _children(state, sensor.props, mi.ObjectType.Film) if sensor else ()
-        formats = [mi.Properties(state.nodes[film].props).get("pixel_format", "rgb") for film in films]
-    return any(str(name).lower() in _FORMATS_WITH_ALPHA for name in formats)
+        formats = [str(film.get("pixel_format", "rgb")) for film in _of_first_sensor(state, mi.ObjectType.Film)]
+    return any(name.lower() in _FORMATS_WITH_ALPHA for name in formats)
+
+
+def _of_first_sensor(state: mi.parser.ParserState, kind: mi.ObjectType) -> list[mi.Properties]:
+    """Return the properties of the children of a kind of the first sensor, if there is one."""
+    sensors = [node for node in state.nodes if node.type == mi.ObjectType.Sensor]
+    return [mi.Properties(state.nodes[k].props) for sensor in sensors[:1] for k in _children(state, sensor.props, kind)]
 
 
 def scene_digest(

@@ -20,7 +20,7 @@ import mitsuba as mi
 import numpy as np
 from numpy.typing import NDArray
 
-from ...bsdf.base import contains_grating
+from ...bsdf.base import gratings_in
 from ...color import XYZ_to_linear_sRGB, delta_E, into_gamut, on_screen, spectrum_to_XYZ
 from ...errors import RequestError
 from ...grating_spectrum import GratingSpectrum
@@ -208,7 +208,7 @@ def _shows_gratings(scene: mi.Scene) -> NDArray[np.bool_]:
     y, x = (np.mgrid[:rows, :columns].reshape(2, -1) + 0.5) / np.array([[rows], [columns]])
     position = mi.Point2f(x.astype(np.float32), y.astype(np.float32))
     si = scene.ray_intersect(mi.Ray3f(sensor.sample_ray(0.0, 0.5, position, mi.Point2f(0.5))[0]))
-    shapes = [shape for shape in scene.shapes() if shape.bsdf() is not None and contains_grating(shape.bsdf())]
+    shapes = [shape for shape in scene.shapes() if gratings_in(shape.bsdf())]
     shown = functools.reduce(operator.or_, (si.shape == mi.ShapePtr(shape) for shape in shapes))
     if not np.any(shown):
         raise RequestError("scene: no pixel shows a grating, there is nothing to compare")

@@ -9,7 +9,7 @@ from dataclasses import dataclass
 import drjit as dr
 import mitsuba as mi
 
-from ...bsdf.base import contains_grating, is_grating, nested
+from ...bsdf.base import gratings_in, is_grating, parts
 from ...bsdf.geometry import rotated
 from ...bsdf.layers import Layers
 from ...errors import RequestError
@@ -30,14 +30,14 @@ def gratings_of(scene: mi.Scene) -> tuple[list[mi.BSDF], list[mi.BSDF]]:
     outer: list[mi.BSDF] = []
     for shape in scene.shapes():
         bsdf = shape.bsdf()
-        if bsdf is None or any(bsdf is other for other in outer) or not contains_grating(bsdf):
+        if any(bsdf is other for other in outer) or not gratings_in(bsdf):
             continue
         outer.append(bsdf)
         inside = [bsdf]
         while inside:
             part = inside.pop()
             if not is_grating(part):
-                inside += nested(part)
+                inside += parts(part, mi.BSDF)
             elif all(part is not other for other in gratings):
                 gratings.append(part)
     for bsdf in gratings:
