@@ -134,22 +134,22 @@ def horizon_gain(x: Array, select: Callable[..., Any] = np.where) -> Array:
     return 1 + t * t * result
 
 
-def fresnel(cosine: ArrayLike, index: float) -> NDArray[np.float64]:
-    """Return F, the reflectance of unpolarised light, of an interface with the relative index n_o/n_i.
+def fresnel(cosine: ArrayLike, index: complex) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Return (R_s, R_p), the power reflectances of a plane.
 
     Args:
         cosine: of the angle of incidence; shapes broadcast.
-        index: n_o/n_i, real. Below one, light is totally reflected beyond the critical angle.
+        index: n + ik of the material relative to the medium of incidence; ∞ of a perfect mirror. For a real index below
+            one, light is totally reflected beyond the critical angle.
     """
-    within = np.sqrt(np.maximum(1 - (1 - np.square(cosine)) / index**2, 0))
-    return _fresnel(cosine, within, index)
-
-
-def _fresnel(cos_i: Array, cos_o: Array, index: float) -> NDArray[np.float64]:
-    """Return F from the cosines on both sides."""
-    s = (cos_i - index * cos_o) / np.maximum(cos_i + index * cos_o, 1e-12)
-    p = (index * cos_i - cos_o) / np.maximum(index * cos_i + cos_o, 1e-12)
-    return (s**2 + p**2) / 2
+    cosine = np.asarray(cosine, np.float64)
+    if np.isinf(index):
+        return np.ones_like(cosine), np.ones_like(cosine)
+    square = index**2 - 1 + cosine**2
+    root = np.sqrt(square if np.iscomplexobj(square) else np.maximum(square, 0))
+    s = (cosine - root) / (cosine + root)
+    p = (index**2 * cosine - root) / (index**2 * cosine + root)
+    return np.abs(s) ** 2, np.abs(p) ** 2
 
 
 def transmitted(
@@ -164,9 +164,8 @@ def transmitted(
         min_v_z: lower bound of |v_z| in K.
     """
     square = tangent_square + (cos_i - index * np.asarray(cos_o)) ** 2
-    # F depends on the ratio of ω_i·h and ω_o·h alone.
-    along_i, along_o = np.abs(square + 1 - index**2) / 2, np.abs(square - 1 + index**2) / (2 * index)
+    cos_half = np.abs(square + 1 - index**2) / (2 * np.sqrt(square))
     factor = k_g(
         cos_i, index * np.asarray(cos_o), tangent_square, 1 - index**2, False, min_v_z=np.maximum(min_v_z, 1e-6)
     )
-    return factor * (1 - _fresnel(along_i, along_o, index))
+    return factor * (1 - np.mean(fresnel(np.minimum(cos_half, 1), index), axis=0))

@@ -18,9 +18,9 @@ from scipy.ndimage import gaussian_filter
 
 from .efficiency import OrderEfficiencies, description, index_at, numbers
 from .errors import RequestError
-from .geometry import diffracted
+from .geometry import fresnel
 from .progress import Progress, silent
-from .scalar_theory import fresnel, incident_direction
+from .scalar_theory import incident_direction, mirrored
 from .spectrum.grids import OrderGrid
 from .spectrum.power_spectrum import PowerSpectrum
 from .surface.periods import Period
@@ -98,7 +98,7 @@ def peak_efficiencies(
         wavelength, direction = float(wavelengths[w]) * 1e-3, incident_direction(float(angles[a]), azimuth)[:2]
         power, cos_half = _reflected(spectrum, direction, wavelength)
         index, albedo = index_at(wavelength, material, int_ior), max(1.0, power.sum())
-        polarised = np.stack(fresnel(cos_half, index) if np.isfinite(index) else [np.ones_like(power)] * 2) * power
+        polarised = np.stack(fresnel(cos_half, index)) * power
         for k, (region, centre) in enumerate(zip(regions, centres, strict=True)):
             other = _reflected(spectrum, -direction - wavelength * centre, wavelength)[0].sum()
             values[k, a, w] = polarised[:, region].sum(axis=1) / max(albedo, other)
@@ -135,10 +135,13 @@ def _reflected(spectrum: PowerSpectrum, direction: Array, wavelength: float) -> 
     """
     q = np.stack(np.meshgrid(*spectrum.grid.frequencies()), -1)
     power, cos_half = np.zeros(q.shape[:2]), np.ones(q.shape[:2])
-    found = diffracted(direction, wavelength * q)
-    row, column = np.nonzero(found.kept)
-    densities = spectrum.table.powers_at(row, column, 2 * np.pi * found.v_z / wavelength)
-    power[found.kept], cos_half[found.kept] = found.k_g * densities, found.cos_half
+
+    def of_nodes(kept: NDArray[np.bool_], kappa: Array) -> NDArray[np.floating]:
+        row, column = np.nonzero(kept)
+        return spectrum.table.powers_at(row, column, kappa)
+
+    found, reflected = mirrored(of_nodes, direction, wavelength * q, wavelength)
+    power[found.kept], cos_half[found.kept] = reflected, found.cos_half
     return power, cos_half
 
 

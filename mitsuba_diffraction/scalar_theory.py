@@ -21,7 +21,7 @@ from scipy.interpolate import RegularGridInterpolator
 from scipy.special import jv
 
 from .errors import RequestError
-from .geometry import Diffracted, diffracted
+from .geometry import Diffracted, diffracted, fresnel
 from .reference import amplitudes
 from .rigorous.coordinate_transformation import curve_of, is_profile
 from .rigorous.efficiencies import converge
@@ -47,15 +47,6 @@ MAX_TRUSTED_ERROR = 0.1  # above which a surface is considered outside the range
 # R.m.s. factor between the error estimated from the map and that of 48 solved profiles; docs/validation.md.
 ESTIMATE_FACTOR = 1.4
 _MAX_SOLVER_ERROR = 1e-2
-
-
-def fresnel(cosine: ArrayLike, index: complex) -> tuple[Array, Array]:
-    """Return the power reflectances (R_s, R_p) of a plane of index n + ik in air, from the cosine of incidence."""
-    cosine = np.asarray(cosine, np.float64)
-    root = np.sqrt(complex(index) ** 2 - (1 - cosine**2))
-    s = (cosine - root) / (cosine + root)
-    p = (index**2 * cosine - root) / (index**2 * cosine + root)
-    return np.abs(s) ** 2, np.abs(p) ** 2
 
 
 def incident_direction(angle: float, azimuth: float) -> Array:
@@ -159,16 +150,29 @@ def scalar_orders(
     """
     m, steps = _lattice(wavelength / np.atleast_1d(period), 2.0)
 
-    def mirrored(tangent: Array) -> tuple[Diffracted, Array]:
-        """Return the orders of light with this tangential part of ω_i, and K G η_m: what R = 1 reflects."""
-        found = diffracted(tangent, steps)
-        return found, found.k_g * powers(m[found.kept], 2 * np.pi * found.v_z / wavelength)
+    def of_orders(kept: NDArray[np.bool_], kappa: Array) -> Array:
+        return powers(m[kept], kappa)
 
-    found, power = mirrored(incident_direction(angle, azimuth)[:2])
-    albedo = [mirrored(tangent)[1].sum() for tangent in found.tangent]
+    found, power = mirrored(of_orders, incident_direction(angle, azimuth)[:2], steps, wavelength)
+    albedo = [mirrored(of_orders, tangent, steps, wavelength)[1].sum() for tangent in found.tangent]
     power = power / np.maximum(1, np.maximum(power.sum(), albedo))
-    s, p = (1.0, 1.0) if np.isinf(index) else fresnel(found.cos_half, index)
+    s, p = fresnel(found.cos_half, index)
     return Orders(m[found.kept], s * power, p * power)
+
+
+def mirrored(
+    powers: Callable[[NDArray[np.bool_], Array], NDArray[np.floating]], tangent: Array, steps: Array, wavelength: float
+) -> tuple[Diffracted, Array]:
+    """Return the directions of diffracted light, (n,), and K G S there, which a perfect mirror reflects without E.
+
+    Args:
+        powers: (mask of the frequencies that propagate, their κ) → S, or η_m.
+        tangent: the tangential part of ω_i, (2,); nothing is reflected if it is evanescent.
+        steps: λq, (..., 2).
+        wavelength: λ, µm.
+    """
+    found = diffracted(tangent, steps)
+    return found, found.k_g * powers(found.kept, 2 * np.pi * found.v_z / wavelength)
 
 
 def transmitted_orders(

@@ -160,7 +160,7 @@ class OrderSampler:
                     square = 1 - (tangent**2).sum(-1)
                     power = power * (square > 0)
                     if outgoing_below:
-                        power *= 1 - fresnel(np.sqrt(np.maximum(square, 0)), self.eta)
+                        power *= 1 - np.mean(fresnel(np.sqrt(np.maximum(square, 0)), self.eta), axis=0)
                 column, row = (m + self.max_order).T
                 powers[node, row, column] += power
             result += powers**2 / len(furnaces)

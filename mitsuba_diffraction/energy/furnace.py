@@ -214,7 +214,7 @@ class Furnace:
             mirror = np.flatnonzero(b)
             gain = [horizon_gain(cos[mirror] ** 2 / (2 * width[mirror])) for cos in (cos_i, cos_o)]
             value[mirror] += b[mirror] * (gain[0] * gain[1] - value[mirror])
-        return value if self.index is None else value * fresnel(np.sqrt(square) / 2, self.index)
+        return value if self.index is None else value * np.mean(fresnel(np.sqrt(square) / 2, self.index), axis=0)
 
     def _kappa(self, cos_i: Real, cos_o: Real, length: Real, branch: int) -> Real:
         """Return κ in rad/µm of two directions; zero if v_z of transmitted light lacks the sign of the branch."""

@@ -12,8 +12,9 @@ import functools
 import numpy as np
 from numpy.typing import NDArray
 
+from ...geometry import fresnel
 from ...rigorous.efficiencies import efficiencies
-from ...scalar_theory import fresnel, profile_powers, transmitted_orders
+from ...scalar_theory import profile_powers, transmitted_orders
 from ...surface.gratings import blazed, right_angled
 from ...surface.heightfield import HeightField
 from ..record import Check, Record
