@@ -90,7 +90,19 @@ def precompute(
 
 def build_spectrum(patches: Sequence[HeightField], settings: Settings, progress: Progress = silent) -> Spectrum:
     """Compute the spectrum as `precompute`, from patches and settings."""
-    _check_patches(patches, settings)
+    if not patches:
+        raise RequestError("patches: got none, wanted at least one")
+    if len(patches) > 1 and settings.extent != "tile":
+        raise RequestError(f"patches: got {len(patches)} with extent {settings.extent!r}, wanted 1, or extent 'tile'")
+    if len(patches) > 1 and settings.representation in SERIES:
+        raise RequestError(
+            f"representation: got {settings.representation!r} with {len(patches)} patches, wanted 'slices', or "
+            "patches = 1: an average has no amplitude"
+        )
+    first = patches[0]
+    for patch in patches[1:]:
+        if patch.shape != first.shape or not np.allclose(patch.tile_size, first.tile_size, rtol=1e-9):
+            raise RequestError(f"patches: got {patch!r} beside {first!r}, wanted patches of one size")
     height_range = max(patch.height_range for patch in patches)
     if height_range > settings.largest_height_range:
         raise RequestError(
@@ -102,28 +114,9 @@ def build_spectrum(patches: Sequence[HeightField], settings: Settings, progress:
             return GratingSpectrum(**vars(scalar.build_spectrum(patches, settings, progress)))
     if len(patches) > 1:
         raise RequestError(
-            f"theory: got rigorous and {len(patches)} patches ({patches[0].source}, …), wanted one, of one row"
+            f"theory: got rigorous and {len(patches)} patches ({first.source}, …), wanted one, of one row"
         )
-    return rigorous.build_spectrum(patches[0], settings, progress, cache_folder())
-
-
-def _check_patches(height_fields: Sequence[HeightField], settings: Settings) -> None:
-    """Raise RequestError unless there is one patch, or several periodic ones of one size."""
-    if not height_fields:
-        raise RequestError("patches: got none, wanted at least one")
-    if len(height_fields) > 1 and settings.extent != "tile":
-        raise RequestError(
-            f"patches: got {len(height_fields)} with extent {settings.extent!r}, wanted 1, or extent 'tile'"
-        )
-    if len(height_fields) > 1 and settings.representation in SERIES:
-        raise RequestError(
-            f"representation: got {settings.representation!r} with {len(height_fields)} patches, wanted 'slices', or "
-            "patches = 1: an average has no amplitude"
-        )
-    first = height_fields[0]
-    for field in height_fields[1:]:
-        if field.shape != first.shape or not np.allclose(field.tile_size, first.tile_size, rtol=1e-9):
-            raise RequestError(f"patches: got {field!r} beside {first!r}, wanted patches of one size")
+    return rigorous.build_spectrum(first, settings, progress, cache_folder())
 
 
 def load_spectrum(path: str | os.PathLike[str], recipe: str | None = None) -> Spectrum:

@@ -55,19 +55,17 @@ def power_spectrum(
 
         S(q; κ) = (d_x d_y/P) Σ_p |Σ_n a(x_n − x_p) e^{iκh_n} e^{−2πi q·x_n}|² / Σ_n a².
 
-    Its integral over the Nyquist rectangle |q_j| ≤ 1/2d_j is one for every κ; d is the pixel size. The width of the
-    window is given by the coherence length, limited by the size of the scan. Along an axis of one pixel the surface is
-    uniform, and S has the factor N(q_j; σ_q²) of the same coherence length.
+    Its integral over the Nyquist rectangle |q_j| ≤ 1/2d_j is one for every κ; d is the pixel size. Along an axis of one
+    pixel the surface is uniform, and S has the factor N(q_j; σ_q²) of the same coherence length.
 
-    The spectrum is not continued periodically outside the Nyquist limit: a tile has no orders there, only the tails of
-    its last orders, and the spectrum of a sample is zero.
+    Outside the Nyquist limit a tile has the tails of its last orders alone, and the spectrum of a sample is zero.
 
     Args:
         height_field: the patch.
         q: (..., 2) cycles/µm, along x and y.
         kappa: (...) rad/µm.
         extent: "tile" or "sample".
-        coherence_length: L_c in µm.
+        coherence_length: L_c in µm, of a sample limited by the size of the scan.
 
     Returns:
         (...) µm².
@@ -77,7 +75,9 @@ def power_spectrum(
             an argument is not finite, or the shapes do not match.
     """
     Settings(extent, coherence_length)
-    q, kappa = checked(q, kappa)
+    q, kappa = matching(q, kappa)
+    if not np.isfinite(kappa).all():
+        raise RequestError("kappa: got numbers that are not finite, wanted rad/µm")
     evaluate = _tile_spectrum if extent == "tile" else _sample_spectrum
     return evaluate(height_field, q.reshape(-1, 2), kappa.ravel(), coherence_length).reshape(kappa.shape)
 
@@ -109,21 +109,23 @@ def _sample_spectrum(height_field: HeightField, q: Real, kappa: Real, coherence_
     """Compute Welch's estimate of S for q (M, 2) and κ (M,): (M,) µm²."""
     effective = effective_coherence_length(height_field, coherence_length)
     windows = window_axes(height_field, effective)
-    result = mean_periodograms(height_field, q, kappa, tuple(w or UNIFORM for w in windows))
-    for axis in (0, 1):
-        if windows[axis] is None:
-            result *= _gaussian(q[:, axis], lobe_width(effective))
+    result = _mean_periodograms(height_field, q, kappa, *(w or UNIFORM for w in windows))
+    for q_j, window, pixel in zip(q.T, windows, height_field.pixel_size, strict=True):
+        if window is None:
+            result *= _gaussian(q_j, lobe_width(effective))
         else:
-            result *= nyquist_density(q[:, axis], height_field.pixel_size[axis])
+            # Zero outside the Nyquist limit; rounding of q must not exclude the limit itself.
+            result *= np.where(np.abs(q_j) * 2 * pixel <= 1 + 1e-12, pixel, 0.0)
     return result
 
 
-def mean_periodograms(height_field: HeightField, q: Real, kappa: Real, axes: tuple[WindowAxis, ...]) -> Real:
+def _mean_periodograms(
+    height_field: HeightField, q: Real, kappa: Real, along_x: WindowAxis, along_y: WindowAxis
+) -> Real:
     """Average |Σ_n a(x_n − x_p) e^{iκh_n} e^{−2πi q·x_n}|² over the positions x_p for q (M, 2) and κ (M,): (M,).
 
     Window and wave are separable: first the sums over y, for all columns at once, then those over x.
     """
-    along_x, along_y = axes
     width, height = len(along_x.window), len(along_y.window)
     chunk = max(1, MAX_CHUNK // max(height_field.shape))
     result = np.zeros(kappa.shape)
@@ -148,12 +150,6 @@ def _waves(q: Real, count: int, pixel: float) -> NDArray[np.complex128]:
     return np.exp(-2j * np.pi * np.outer(q, np.arange(count) * pixel))
 
 
-def nyquist_density(q: Real, pixel: float) -> Real:
-    """Return d for |q| ≤ 1/2d, else zero: (M,) µm; integrates to one."""
-    # Tolerate rounding of q at the limit itself.
-    return np.where(np.abs(q) * 2 * pixel <= 1 + 1e-12, pixel, 0.0)
-
-
 def _gaussian(q: Real, sigma: float) -> Real:
     """Return N(q; σ²) along one axis, µm."""
     return np.exp(-(q**2) / (2 * sigma**2)) / (np.sqrt(2 * np.pi) * sigma)
@@ -163,11 +159,3 @@ def _by_kappa(kappa: Real) -> Iterator[tuple[float, NDArray[np.int64]]]:
     """Yield each distinct value in κ (M,), with its indices."""
     for value in np.unique(kappa):
         yield value, np.flatnonzero(kappa == value)
-
-
-def checked(q: ArrayLike, kappa: ArrayLike) -> tuple[Real, Real]:
-    """Broadcast q and κ as `matching` does, and raise ValueError unless κ is finite."""
-    q, kappa = matching(q, kappa)
-    if not np.isfinite(kappa).all():
-        raise RequestError("kappa: got numbers that are not finite, wanted rad/µm")
-    return q, kappa

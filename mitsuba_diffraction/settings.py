@@ -83,9 +83,8 @@ class Settings:
     transmission: str = "none"
 
     def __post_init__(self) -> None:
-        if self.extent not in EXTENTS:
-            raise RequestError(f"extent: got {self.extent!r}, wanted 'tile' or 'sample'")
         for name, known in (
+            ("extent", EXTENTS),
             ("theory", THEORIES),
             ("representation", REPRESENTATIONS),
             ("heights_from", ORIGINS),
@@ -93,11 +92,18 @@ class Settings:
         ):
             if (value := getattr(self, name)) not in known:
                 raise RequestError(f"{name}: got {value!r}, wanted one of {', '.join(known)}")
-        for name in ("coherence_length", "largest_angle", "tolerance", "largest_height_range", "ext_ior"):
+        min_tolerance = MIN_TOLERANCE if self.theory == "scalar" else MIN_RIGOROUS_TOLERANCE
+        min_length, max_length = MIN_COHERENCE_LENGTH, MAX_COHERENCE_LENGTH
+        for name, valid, wanted in (
+            ("coherence_length", lambda x: min_length <= x <= max_length, f"µm, {min_length:g} to {max_length:g}"),
+            ("largest_angle", lambda x: 0 < x <= 90, "degrees from the normal, above 0, at most 90"),
+            ("tolerance", lambda x: min_tolerance <= x < 1, f"a fraction of the light, from {min_tolerance:g} to 1"),
+            ("largest_height_range", lambda x: x > 0, "a positive number of µm"),
+            ("ext_ior", lambda x: 1 <= x <= 10, "the index of the medium above, from 1 to 10"),
+        ):
             value = getattr(self, name)
-            if not (is_number(value) or (name == "tolerance" and value is None)):
-                raise RequestError(f"{name}: got {value!r}, wanted a number")
-        lobe_width(self.coherence_length)
+            if not ((is_number(value) and valid(value)) or (name == "tolerance" and value is None)):
+                raise RequestError(f"{name}: got {value!r}, wanted {wanted}")
         try:
             shortest, longest = (float(w) for w in self.wavelengths)
         except (TypeError, ValueError, OverflowError):
@@ -108,22 +114,7 @@ class Settings:
                 f"{MIN_WAVELENGTH:g} nm"
             )
         object.__setattr__(self, "wavelengths", (shortest, longest))
-        if not 0 < self.largest_angle <= 90:
-            raise RequestError(
-                f"largest_angle: got {self.largest_angle!r}, wanted degrees from the normal, above 0, at most 90"
-            )
         self._check_series()
-        minimum = MIN_TOLERANCE if self.theory == "scalar" else MIN_RIGOROUS_TOLERANCE
-        if self.tolerance is not None and not minimum <= self.tolerance < 1:
-            raise RequestError(
-                f"tolerance: got {self.tolerance!r}, wanted a fraction of the reflected power from {minimum:g} to 1"
-            )
-        if not self.largest_height_range > 0:
-            raise RequestError(
-                f"largest_height_range: got {self.largest_height_range!r}, wanted a positive number of µm"
-            )
-        if not 1 <= self.ext_ior <= 10:
-            raise RequestError(f"ext_ior: got {self.ext_ior!r}, wanted the index of the medium above, from 1 to 10")
         if not isinstance(self.polarised, bool):
             raise RequestError(f"polarised: got {self.polarised!r}, wanted True or False")
         if self.theory == "rigorous" and (self.extent, self.largest_angle, self.representation) != ("tile", 90, "auto"):
@@ -197,15 +188,7 @@ def lobe_width(coherence_length: float) -> float:
 
     The window is Gaussian in amplitude, a(x) = exp(−|x|²/2σ_s²) with σ_s = L_c/4; the power of its transform is a
     Gaussian of standard deviation σ_q = 1/(2√2 π σ_s).
-
-    Raises:
-        ValueError: if the coherence length is not 1 nm to 1 m.
     """
-    if not MIN_COHERENCE_LENGTH <= coherence_length <= MAX_COHERENCE_LENGTH:
-        raise RequestError(
-            f"coherence_length: got {coherence_length!r}, wanted a positive number of µm, "
-            f"{MIN_COHERENCE_LENGTH:g} to {MAX_COHERENCE_LENGTH:g}"
-        )
     return 1 / (2 * math.sqrt(2) * math.pi * (coherence_length / 4))
 
 

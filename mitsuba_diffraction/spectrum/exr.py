@@ -71,26 +71,19 @@ def read(path: Path, kind: str, version: int, recipe: str | None) -> tuple[dict[
     """Read header and channels of a file that `write` wrote."""
     if not path.is_file():
         raise FileNotFoundError(f"{path}: no such file")
-    try:
-        intact = is_intact(path)
-        if intact is False:
-            # Checked before OpenEXR reads it: a wrong size in the header could exhaust memory.
-            raise RequestError("damaged: its bytes are not those that were written")
-        with silence():
-            file = OpenEXR.File(str(path), separate_channels=True)
-            header, channels = file.header(), file.channels()
-    except Exception as error:
-        raise RequestError(f"{path}: not a readable OpenEXR file ({one_line(error)})") from None
+    wanted = f"wanted a {kind.removeprefix('mitsuba_diffraction ')}, as mitsuba-diffraction precompute writes it"
+    # Before OpenEXR reads it: a wrong size in the header could exhaust memory.
+    if not is_intact(path):
+        raise RequestError(f"{path}: damaged, or another file (its SHA-256 is wrong or missing); {wanted}")
+    file = OpenEXR.File(str(path), separate_channels=True)
+    header, channels = file.header(), file.channels()
     if header.get("format") != kind:
-        name = kind.removeprefix("mitsuba_diffraction ")
-        raise RequestError(f"{path}: an OpenEXR file, but not a {name}, which mitsuba-diffraction precompute writes")
+        raise RequestError(f"{path}: an OpenEXR file of another kind; {wanted}")
     if header.get("formatVersion") != version:
         raise RequestError(
             f"{path}: got format version {header.get('formatVersion')}, wanted {version}; "
             "build the spectrum again with this version of mitsuba_diffraction"
         )
-    if not intact:
-        raise RequestError(f"{path}: a damaged spectrum (its SHA-256 is missing)")
     if recipe not in (None, header.get("recipeSha256")):
         raise RequestError(f"{path}: a spectrum of another recipe")
     return header, channels

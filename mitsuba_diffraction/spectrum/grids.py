@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+import itertools
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from typing import Any
 
@@ -13,18 +14,11 @@ from numpy.typing import NDArray
 
 from ..errors import RequestError
 
-# Lattices, in units of the spacing, that together are one of half the spacing between the nodes.
-SHIFTS = ((-0.25, -0.25), (-0.25, 0.25), (0.25, -0.25), (0.25, 0.25))
-
 
 class _Rectangle:
     """The nodes m = (m_x, m_y), |m_x| ≤ M_x, |m_y| ≤ M_y."""
 
     max_order: tuple[int, int]
-
-    def _check(self) -> None:
-        if not all(m >= 0 for m in self.max_order):
-            raise RequestError(f"max_order: got {self.max_order}, wanted two integers ≥ 0")
 
     @property
     def shape(self) -> tuple[int, int]:
@@ -67,7 +61,6 @@ class OrderGrid(_Rectangle):
     def __post_init__(self) -> None:
         if not all(np.isfinite(t) and t > 0 for t in self.tile_size):
             raise RequestError(f"tile_size: got {self.tile_size}, wanted two positive lengths in µm")
-        self._check()
 
     @classmethod
     def reachable(cls, tile_size: tuple[float, float], pixels: tuple[int, int], max_frequency: float) -> OrderGrid:
@@ -158,9 +151,6 @@ class SplineGrid(_Rectangle):
     def __post_init__(self) -> None:
         if not all(np.isfinite(d) and d > 0 for d in self.spacing):
             raise RequestError(f"spacing: got {self.spacing}, wanted two positive numbers in cycles/µm")
-        self._check()
-        if not all(limit > 0 for limit in self.limit):
-            raise RequestError(f"limit: got {self.limit}, wanted two positive numbers in cycles/µm")
 
     def __str__(self) -> str:
         x, y = self.spacing
@@ -198,29 +188,29 @@ class SplineGrid(_Rectangle):
         self,
         kept: OrderGrid | SplineGrid,
         coefficients: NDArray[np.float32],
-        exact: NDArray[np.float64],
-        shift: tuple[float, float],
+        exact: Callable[[float, float], NDArray[np.float64]],
         max_q: tuple[float, float],
     ) -> float:
-        """Compute ∫|S_approx − S_exact| dq up to `max_q`, by the rectangle rule on the lattice shifted by `shift` Δ.
+        """Compute ∫|S_approx − S_exact| dq up to `max_q`, by the rectangle rule on a lattice of half the spacing.
 
         Args:
             kept: the smaller grid of the approximation.
             coefficients: c_m on it; zero outside.
-            exact: S Δ_x Δ_y on the shifted lattice, of the shape of this grid.
-            shift: (x, y), each within ±½.
+            exact: returns S Δ_x Δ_y, of the shape of this grid, on the lattice shifted by (x, y), in spacings.
             max_q: (x, y) in cycles/µm.
         """
-        weights_x, weights_y = (np.array(spline_weights(s)) for s in shift)
-        approximate = np.zeros(self.shape)
-        approximate[inner(self, kept)] = coefficients
-        approximate = scipy.ndimage.correlate1d(approximate, weights_x, axis=1, mode="constant")
-        approximate = scipy.ndimage.correlate1d(approximate, weights_y, axis=0, mode="constant")
-        inside_x, inside_y = (
-            np.abs(m + s) * spacing <= end
-            for m, spacing, s, end in zip(self.axes(), self.spacing, shift, max_q, strict=True)
-        )
-        return float(inside_y @ np.abs(np.maximum(approximate, 0) - exact) @ inside_x)
+        padded, errors = np.zeros(self.shape), []
+        padded[inner(self, kept)] = coefficients
+        for shift in itertools.product((-0.25, 0.25), repeat=2):
+            weights_x, weights_y = (np.array(spline_weights(s)) for s in shift)
+            approximate = scipy.ndimage.correlate1d(padded, weights_x, axis=1, mode="constant")
+            approximate = scipy.ndimage.correlate1d(approximate, weights_y, axis=0, mode="constant")
+            inside_x, inside_y = (
+                np.abs(m + s) * spacing <= end
+                for m, spacing, s, end in zip(self.axes(), self.spacing, shift, max_q, strict=True)
+            )
+            errors.append(inside_y @ np.abs(np.maximum(approximate, 0) - exact(*shift)) @ inside_x)
+        return float(np.mean(errors))
 
 
 def spline(x: NDArray[np.float64]) -> NDArray[np.float64]:

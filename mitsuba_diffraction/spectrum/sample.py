@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 from ..errors import RequestError
 from ..settings import lobe_width
 from ..surface.heightfield import HeightField
-from .grids import SHIFTS, OrderGrid, SplineGrid
+from .grids import OrderGrid, SplineGrid
 from .tables import derivative_bound
 
 # Windows are truncated at ±3 σ_s, where their amplitude is e^{−9/2}, 1 %.
@@ -49,7 +49,6 @@ def effective_coherence_length(height_field: HeightField, requested: float) -> f
     Raises:
         ValueError: if it is below four pixels, too short for a window.
     """
-    lobe_width(requested)
     axes = list(zip(height_field.tile_size, height_field.pixel_size, height_field.shape[::-1], strict=True))
     effective = min([float(requested), *(_MAX_COHERENCE_FRACTION * size for size, _, count in axes if count > 1)])
     for _, pixel, count in axes:
@@ -216,12 +215,13 @@ class SamplePowers:
 
     def error(self, kept: OrderGrid | SplineGrid, powers: NDArray[np.float32], kappa: float) -> float:
         """Return ∫|S_approx − S_exact| dq over the frequencies that light reaches; arguments of `TilePowers.error`."""
-        autocorrelation, errors = self._autocorrelation(kappa), []
-        for shift in SHIFTS:
+        autocorrelation = self._autocorrelation(kappa)
+
+        def exact(*shift: float) -> NDArray[np.float64]:
             x, y = (np.exp(-2j * np.pi * s * lags.lags / lags.count) for s, lags in zip(shift, self._lags, strict=True))
-            exact = self._transform(autocorrelation * y[:, None] * x[self._lags[0].lags >= 0])
-            errors.append(self.grid.error(kept, powers, exact, shift, self._max_q))
-        return float(np.mean(errors))
+            return self._transform(autocorrelation * y[:, None] * x[self._lags[0].lags >= 0])
+
+        return self.grid.error(kept, powers, exact, self._max_q)
 
 
 # Batches of segments, unlike segments, reveal correlation of a surface over more than the width of a window.

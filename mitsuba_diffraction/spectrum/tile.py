@@ -11,7 +11,7 @@ import scipy.linalg
 from numpy.typing import NDArray
 
 from ..surface.heightfield import HeightField
-from .grids import SHIFTS, OrderGrid, SplineGrid, inner, spline
+from .grids import OrderGrid, SplineGrid, inner, spline
 from .tables import derivative_bound
 
 
@@ -121,11 +121,12 @@ class TileSplines:
 
     def error(self, kept: OrderGrid | SplineGrid, powers: NDArray[np.float32], kappa: float) -> float:
         """Return ∫|S_approx − S_exact| dq over the frequencies that light reaches; arguments of `TilePowers.error`."""
-        of_orders, errors = self._powers(kappa), []
-        for shift in SHIFTS:
+        of_orders = self._powers(kappa)
+
+        def exact(*shift: float) -> NDArray[np.float64]:
             along_x, along_y = (
-                self._lobes(np.arange(-max_order, max_order + 1) + s, orders)
-                for max_order, s, orders in zip(self.grid.max_order, shift, self._orders, strict=True)
+                self._lobes(m + s, orders) for m, s, orders in zip(self.grid.axes(), shift, self._orders, strict=True)
             )
-            errors.append(self.grid.error(kept, powers, along_y @ of_orders @ along_x.T, shift, self._max_q))
-        return float(np.mean(errors))
+            return along_y @ of_orders @ along_x.T
+
+        return self.grid.error(kept, powers, exact, self._max_q)

@@ -452,5 +452,5 @@ def test_precompute_writes_a_recipes_rigorous_spectrum(command, tmp_path):
     content = bytearray(target.read_bytes())
     content[-200] ^= 1
     target.write_bytes(content)
-    with pytest.raises(ValueError, match="its bytes are not those that were written"):
+    with pytest.raises(ValueError, match="its SHA-256 is wrong or missing"):
         RigorousSpectrum.load(target)

@@ -70,7 +70,7 @@ def files():
         ("precompute blaze.toml --tolerance nan", "tolerance: got nan"),
         ("precompute blaze.toml --coherence-length -3", "coherence_length: got -3"),
         ("precompute blaze.toml --representation wavelets", "representation: got 'wavelets'"),
-        ("precompute blaze.toml --extent ribbon", "extent: got 'ribbon', wanted 'tile' or 'sample'"),
+        ("precompute blaze.toml --extent ribbon", "extent: got 'ribbon', wanted one of tile, sample"),
         ("precompute blaze.toml --largest-angle 91", "largest_angle: got 91"),
         ("precompute blaze.toml --largest-angle steep", "--largest-angle"),
         ("precompute deep.toml --representation taylor", "of a range of 4.92 µm"),

@@ -468,7 +468,7 @@ def test_nan_does_not_become_a_number(q):
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
-        ({"extent": "ribbon"}, "extent: got 'ribbon', wanted 'tile' or 'sample'"),
+        ({"extent": "ribbon"}, "extent: got 'ribbon', wanted one of tile, sample"),
         ({"extent": "sample", "coherence_length": 0.0}, "coherence_length: got"),
         ({"coherence_length": 0.0}, "coherence_length: got"),
         ({"coherence_length": -1.0}, "coherence_length: got"),

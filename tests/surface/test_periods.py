@@ -249,7 +249,7 @@ def test_the_count_is_a_positive_integer(count):
 
 
 def test_the_extent_is_known():
-    with pytest.raises(ValueError, match="extent: got 'ribbon', wanted 'tile' or 'sample'"):
+    with pytest.raises(ValueError, match="extent: got 'ribbon', wanted one of tile, sample"):
         find_periods(HeightField(wave((20, 20), 0.3, 0), PIXEL), extent="ribbon")
 
 
