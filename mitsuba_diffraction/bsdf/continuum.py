@@ -26,7 +26,7 @@ class SplineSpectrum:
 
     resolved = False
 
-    def __init__(self, spectrum: GratingSpectrum, sampler: BinSampler) -> None:
+    def __init__(self, spectrum: GratingSpectrum, typical_max_kappa: float | None) -> None:
         grid = cast(SplineGrid, spectrum.grid)
         self.power = SlicePower(cast(SliceTable, spectrum.table), (RIM, RIM))
         self.max_node_x, self.max_node_y = grid.max_order
@@ -34,18 +34,13 @@ class SplineSpectrum:
         self.per_area = opaque(1 / (grid.spacing[0] * grid.spacing[1]))
         self.limit_x, self.limit_y = (opaque(limit) for limit in grid.limit)
         self.per_width = opaque(1 / spectrum.lobe_width)
-        self.sampler = sampler
+        self.sampler = BinSampler(spectrum, typical_max_kappa)
 
     def meets(self, q_x: mi.Float, q_y: mi.Float, scale: mi.Float | float) -> mi.Bool:
         """Return true: a continuum has no gaps."""
         return mi.Bool(True)
 
-    def evaluate(
-        self,
-        geometry: Geometry,
-        incidence: Incidence,
-        active: mi.Bool,
-    ) -> tuple[mi.Float, mi.Float]:
+    def evaluate(self, geometry: Geometry, incidence: Incidence, active: mi.Bool) -> tuple[mi.Float, mi.Float]:
         """Evaluate n_o² K G S(q; κ) |cos θ_o| and the density of q, both in µm², as `Scattering.evaluate`.
 
         K and G are those of the pair of directions (`Geometry.continuum_factor`), as no order is known.
@@ -70,12 +65,6 @@ class SplineSpectrum:
         )
         return dr.select(inside, power, 0), self.sampler.density(incidence.q_sign * q, incidence, active)
 
-    def sample(
-        self,
-        incidence: Incidence,
-        u: mi.Float,
-        v: mi.Point2f,
-        active: mi.Bool,
-    ) -> tuple[mi.Point2f, mi.Bool]:
+    def sample(self, incidence: Incidence, u: mi.Float, v: mi.Point2f, active: mi.Bool) -> tuple[mi.Point2f, mi.Bool]:
         """Draw q in cycles/µm, for one wavelength; as no order is chosen, none is evanescent."""
         return self.sampler.sample(incidence, u, v, active), active

@@ -36,8 +36,6 @@ class WaveVector:
         square: k_z² outside.
         index: n outside.
         inner_index: n next to the relief, which differs under a coat and inside of a sheet.
-        per_inner_index: its reciprocal.
-        excess: n² next to the relief minus n² outside.
         sign: 1 above, −1 below.
     """
 
@@ -45,14 +43,12 @@ class WaveVector:
     square: mi.Float
     index: mi.Float
     inner_index: mi.Float
-    per_inner_index: mi.Float
-    excess: mi.Float
     sign: mi.Float
 
     def normal(self, square: mi.Float) -> mi.Float:
         """Return |k_z| next to the relief, from k_z² outside."""
         # Positive, as the root has no derivative at zero.
-        return dr.sqrt(larger(square + self.excess, 1e-12))
+        return dr.sqrt(larger(square + (dr.square(self.inner_index) - dr.square(self.index)), 1e-12))
 
     @property
     def z(self) -> mi.Float:
@@ -61,7 +57,7 @@ class WaveVector:
 
     def inner(self) -> mi.Vector3f:
         """Return the direction next to the relief, a unit vector."""
-        return mi.Vector3f(*self.tangent, self.z) * self.per_inner_index
+        return mi.Vector3f(*self.tangent, self.z) / self.inner_index
 
 
 # Of reflected and of transmitted samples: if the transmitted fraction is tabulated, if it is that of a plane, and in
@@ -99,8 +95,6 @@ class Interface:
         self.rigorous, self.kappas, self.transmitted_fraction = rigorous, kappas, transmitted_fraction
         # In reflection literals, so that Dr.Jit eliminates the terms of the medium below.
         self.eta = mi.Float(1.0) if eta is None else eta
-        self.per_eta, self.excess = dr.rcp(self.eta), dr.square(self.eta) - 1
-        self._per_coat, self._coat_excess = dr.rcp(self.coat_index), dr.square(self.coat_index) - 1
 
     def min_kappa(self, height_scale: mi.Float) -> mi.Float:
         """Return κ₁ in rad/µm, at most the κ of the undiffracted order at all wavelengths."""
@@ -131,22 +125,17 @@ class Interface:
     def wave_vector(self, omega: mi.Vector3f) -> WaveVector:
         """Return k of a direction ω."""
         above = omega.z > 0 if self.transmits else mi.Bool(True)
-        index = self._outer_index(above)
-        return self._wave_vector(above, mi.Vector2f(omega.x, omega.y) * index, dr.square(omega.z * index))
+        index, inner_index, sign = self._medium(above)
+        return WaveVector(mi.Vector2f(*omega.xy) * index, dr.square(omega.z * index), index, inner_index, sign)
 
-    def _outer_index(self, above: mi.Bool) -> mi.Float:
-        return mi.Float(1.0) if self.is_sheet else dr.select(above, mi.Float(1), self.eta)
-
-    def _wave_vector(self, above: mi.Bool, tangent: mi.Vector2f, square: mi.Float) -> WaveVector:
-        of_medium = (self.coat_index, self.eta), (self._per_coat, self.per_eta)
-        inner, per_inner = (dr.select(above, upper, lower) for upper, lower in of_medium)
-        excess = dr.select(above, self._coat_excess, self.excess if self.is_sheet else 0)
-        sign = dr.select(above, mi.Float(1), -1)
-        return WaveVector(tangent, square, self._outer_index(above), inner, per_inner, excess, sign)
+    def _medium(self, above: mi.Bool) -> tuple[mi.Float, mi.Float, mi.Float]:
+        """Return n outside, n next to the relief and the sign of the medium above or below."""
+        outer = mi.Float(1.0) if self.is_sheet else dr.select(above, mi.Float(1), self.eta)
+        return outer, dr.select(above, self.coat_index, self.eta), dr.select(above, mi.Float(1), -1)
 
     def scattered(self, k_i: WaveVector, reflects: mi.Bool) -> WaveVector:
         """Return k in the medium into which light of `k_i` is scattered: k_∥ of undiffracted light, k_z² of `k_i`."""
-        return self._wave_vector((k_i.sign > 0) == reflects, -k_i.tangent, k_i.square)
+        return WaveVector(-k_i.tangent, k_i.square, *self._medium((k_i.sign > 0) == reflects))
 
     def transmission_probability(self, omega: mi.Vector3f) -> mi.Float:
         """Return the probability that a sample is transmitted, about the transmitted fraction of power.
@@ -179,7 +168,6 @@ class Geometry:
         height_scale: factor of the heights.
         shadowing: whether G is a factor.
         min_kappa: κ₁ in rad/µm.
-        coat_index: as of `Interface`.
     """
 
     incident: WaveVector
@@ -191,7 +179,6 @@ class Geometry:
     height_scale: mi.Float
     shadowing: bool
     min_kappa: mi.Float
-    coat_index: mi.Float
 
     @classmethod
     def of(
@@ -216,7 +203,6 @@ class Geometry:
             height_scale=height_scale,
             shadowing=shadowing,
             min_kappa=interface.min_kappa(height_scale),
-            coat_index=interface.coat_index,
         )
 
     @property
@@ -234,7 +220,7 @@ class Geometry:
 
     def cosines(self) -> tuple[mi.Float, mi.Float]:
         """Return |cos θ_i| and |cos θ_o| next to the relief."""
-        return tuple(k.normal(k.square) * k.per_inner_index for k in (self.incident, self.outgoing))
+        return tuple(k.normal(k.square) / k.inner_index for k in (self.incident, self.outgoing))
 
     def cos_half(self) -> mi.Float:
         """Return the cosine of ω and h, negative from below as `mi.fresnel` expects.
@@ -244,8 +230,8 @@ class Geometry:
         """
         k_i, k_o = self.incident, self.outgoing
         square = dr.squared_norm(self.tangent) + dr.square(self.v_z)
-        per_index = dr.select(self.reflects | (k_i.sign > 0), k_i.per_inner_index, k_o.per_inner_index)
-        cos = 0.5 * dr.abs(square + k_i.sign * self._excess) * dr.rsqrt(larger(square, 1e-12)) * per_index
+        index = dr.select(self.reflects | (k_i.sign > 0), k_i.inner_index, k_o.inner_index)
+        cos = 0.5 * dr.abs(square + k_i.sign * self._excess) * dr.rsqrt(larger(square, 1e-12)) / index
         return dr.select(self.reflects, k_i.sign, 1) * smaller(cos, 1)
 
     @property

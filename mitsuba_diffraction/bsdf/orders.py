@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copy
 from collections.abc import Sequence
 from typing import cast
 
@@ -17,14 +18,7 @@ from .continuum_sampler import BinSampler
 from .geometry import Geometry, Incidence
 from .inversion import truncated_gaussian
 from .order_sampler import OrderSampler
-from .tables import (
-    HalfTable,
-    PacketTable,
-    SharedExponentTable,
-    integer_part,
-    larger,
-    opaque,
-)
+from .tables import HalfTable, PacketTable, SharedExponentTable, integer_part, larger, opaque
 
 # Nodes are stored in squares of 4 × 4, so that a window of nodes of one word lies in one to four cache lines.
 _SQUARE_SIDE = 4
@@ -282,18 +276,28 @@ def _hermite(
 MAX_DRAWN_LOBE_WIDTH = 0.03
 
 
-class OrderTable:
-    """The orders of a tile: their lobes and powers.
+class OrderSpectrum:
+    """S(q; κ) = Σ_m η_m(κ) N(q − m/T; σ_q² I), and the density from which q is drawn.
+
+    N is truncated as in `OrderGrid.lobes`. If orders are resolved, at most one of them contributes at q, and lobes may
+    be scaled; for a tile as large as the coherence length, 4 × 4 orders contribute.
+
+    For resolved orders the density is Σ_m P_m N(q − m/T), with P_m of an `OrderSampler`, which depends on the media and
+    scales of a scene. For overlapping orders, and for line gratings with wide lobes, it is that of `BinSampler`.
 
     Attributes:
         axes: the orders along x and y.
-        resolved: whether at most one order contributes at q, and an order is drawn instead of q.
         is_line: whether there is one order along x or y.
+        resolved: whether at most one order contributes at q, and an order is drawn instead of q.
         power: η_m(κ).
         per_width: 1/σ_q.
+        sampler: that of overlapping orders, or else of a scene.
     """
 
-    def __init__(self, spectrum: GratingSpectrum) -> None:
+    sampler: OrderSampler | BinSampler
+
+    def __init__(self, spectrum: GratingSpectrum, typical_max_kappa: float | None) -> None:
+        """Arrange the tables; `typical_max_kappa` as of `KappaBins`."""
         grid, sigma = cast(OrderGrid, spectrum.grid), spectrum.lobe_width
         self.axes = tuple(
             _Axis(lobe, size, max_order, sigma)
@@ -302,6 +306,8 @@ class OrderTable:
         self.is_line = 1 in grid.shape
         is_wide = self.is_line and sigma > MAX_DRAWN_LOBE_WIDTH
         self.resolved = all(axis.count == 1 for axis in self.axes) and not is_wide
+        if not self.resolved:
+            self.sampler = BinSampler(spectrum, typical_max_kappa)
         self.power: AmplitudePower | SlicePower
         rim, windows = (self.axes[0].rim, self.axes[1].rim), not self.resolved
         if isinstance(spectrum.table, AmplitudeTable):
@@ -315,22 +321,11 @@ class OrderTable:
         """The maximum lateral scale for which resolved orders stay so."""
         return min((axis.max_scale for axis in self.axes if axis.max_order), default=np.inf)
 
-
-class OrderSpectrum:
-    """S(q; κ) = Σ_m η_m(κ) N(q − m/T; σ_q² I), and the density from which q is drawn.
-
-    N is truncated as in `OrderGrid.lobes`. If orders are resolved, at most one of them contributes at q; for a tile as
-    large as the coherence length, 4 × 4 orders do.
-
-    For resolved orders the density is Σ_m P_m N(q − m/T), with P_m of an `OrderSampler`, which depends on the media and
-    scales of a scene. For overlapping orders, and for line gratings with wide lobes, it is that of `BinSampler`.
-
-    Lobes of resolved orders may be scaled.
-    """
-
-    def __init__(self, table: OrderTable, sampler: OrderSampler | BinSampler) -> None:
-        self.axes, self.power, self.per_width = table.axes, table.power, table.per_width
-        self.resolved, self.is_line, self.sampler = table.resolved, table.is_line, sampler
+    def drawn_by(self, sampler: OrderSampler) -> OrderSpectrum:
+        """Return resolved orders with the sampler of a scene, which share the tables."""
+        result = copy.copy(self)
+        result.sampler = sampler
+        return result
 
     def meets(self, q_x: mi.Float, q_y: mi.Float, scale: mi.Float | float) -> mi.Bool:
         """Return whether q (cycles/µm) lies in the lobe, scaled by `scale`, of an order; true where lobes overlap."""
@@ -339,12 +334,7 @@ class OrderSpectrum:
         along_x, along_y = self.axes
         return along_x.contains(along_x.first(q_x), q_x, scale) & along_y.contains(along_y.first(q_y), q_y, scale)
 
-    def evaluate(
-        self,
-        geometry: Geometry,
-        incidence: Incidence,
-        active: mi.Bool,
-    ) -> tuple[mi.Float, mi.Float]:
+    def evaluate(self, geometry: Geometry, incidence: Incidence, active: mi.Bool) -> tuple[mi.Float, mi.Float]:
         """Evaluate n_o² K G S(q; κ) |cos θ_o| and the density of q, both in µm², for one wavelength.
 
         For resolved orders, and for all orders of line gratings, K and G are those of each order, with the gain of its
@@ -396,13 +386,7 @@ class OrderSpectrum:
         along_x, along_y = self.axes
         return mi.Vector2f(mi.Float(m_x) * along_x.pitch, mi.Float(m_y) * along_y.pitch) * wavelength
 
-    def sample(
-        self,
-        incidence: Incidence,
-        u: mi.Float,
-        v: mi.Point2f,
-        active: mi.Bool,
-    ) -> tuple[mi.Point2f, mi.Bool]:
+    def sample(self, incidence: Incidence, u: mi.Float, v: mi.Point2f, active: mi.Bool) -> tuple[mi.Point2f, mi.Bool]:
         """Draw q in cycles/µm, for one wavelength; return it and whether its order propagates."""
         if isinstance(self.sampler, BinSampler):
             return self.sampler.sample(incidence, u, v, active), active

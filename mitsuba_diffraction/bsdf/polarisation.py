@@ -54,15 +54,8 @@ def through_layer(
     grating = split(inside[first], inside[last], *across)
     matrix = face(last, inside[last].z, 1 / eta) @ grating @ face(first, outside[first].z, eta)
     source, exit_ = outside[first], outside[last]
-    return mi.mueller.rotate_mueller_basis(
-        matrix,
-        -source,
-        across[0],
-        mi.mueller.stokes_basis(-source),
-        exit_,
-        across[1],
-        mi.mueller.stokes_basis(exit_),
-    )
+    bases = mi.mueller.stokes_basis(-source), mi.mueller.stokes_basis(exit_)
+    return mi.mueller.rotate_mueller_basis(matrix, -source, across[0], bases[0], exit_, across[1], bases[1])
 
 
 def of_facets(
@@ -85,36 +78,22 @@ def of_facets(
         reflects = (source.z > 0) == (exit_.z > 0)
         cos_half = dr.abs(dr.dot(dr.select(reflects | (source.z > 0), source, exit_), half))
         found = planes(dr.select(reflects & (source.z < 0), -cos_half, cos_half), reflects)
-        return _of_facet(value, found, half, source, exit_, source_axis, exit_axis)
+        # For equal indices all entries and `value` are zero.
+        intensities = [dr.select(plane[0, 0] > 0, plane[0, 0], 1) for plane in found]
+        relative = [
+            [[plane[i, j] / intensity for j in range(4)] for i in range(4)]
+            for plane, intensity in zip(found, intensities, strict=True)
+        ]
+        # The s axes are perpendicular to the plane of reflection; for retroreflection, to h.
+        axes = [dr.cross(half, -source), dr.cross(half, exit_)]
+        is_retroreflected = dr.squared_norm(axes[0]) < 1e-12
+        across = mi.coordinate_system(half)[0]
+        axes = [dr.select(is_retroreflected, across, dr.normalize(axis)) for axis in axes]
+        return mi.mueller.rotate_mueller_basis(
+            _matrix(value, relative), -source, axes[0], source_axis, exit_, axes[1], exit_axis
+        )
 
     return split
-
-
-def _of_facet(
-    value: mi.UnpolarizedSpectrum,
-    planes: list[mi.Matrix4f],
-    half: mi.Vector3f,
-    source: mi.Vector3f,
-    exit_: mi.Vector3f,
-    source_axis: mi.Vector3f,
-    exit_axis: mi.Vector3f,
-) -> mi.Spectrum:
-    """Return the matrix of a plane perpendicular to `half`, from that of each channel between s axes."""
-    # For equal indices all entries and `value` are zero.
-    intensities = [dr.select(plane[0, 0] > 0, plane[0, 0], 1) for plane in planes]
-    matrix = _matrix(
-        value,
-        [
-            [[plane[i, j] / intensity for j in range(4)] for i in range(4)]
-            for plane, intensity in zip(planes, intensities, strict=True)
-        ],
-    )
-    # The s axes are perpendicular to the plane of reflection; for retroreflection, to h.
-    axes = [dr.cross(half, -source), dr.cross(half, exit_)]
-    is_retroreflected = dr.squared_norm(axes[0]) < 1e-12
-    across = mi.coordinate_system(half)[0]
-    axes = [dr.select(is_retroreflected, across, dr.normalize(axis)) for axis in axes]
-    return mi.mueller.rotate_mueller_basis(matrix, -source, axes[0], source_axis, exit_, axes[1], exit_axis)
 
 
 def of_orders(
@@ -133,7 +112,7 @@ def of_orders(
 
     def split(source: mi.Vector3f, exit_: mi.Vector3f, source_axis: mi.Vector3f, exit_axis: mi.Vector3f) -> mi.Spectrum:
         matrix = _matrix(value, [entries(channel, source, exit_) for channel in range(len(value))])
-        axes = [_projected(grooves, omega) for omega in (source, exit_)]
+        axes = [dr.normalize(grooves - dr.dot(grooves, omega) * omega) for omega in (source, exit_)]
         return mi.mueller.rotate_mueller_basis(matrix, -source, axes[0], source_axis, exit_, axes[1], exit_axis)
 
     return split
@@ -149,11 +128,6 @@ def _matrix(value: mi.UnpolarizedSpectrum, entries: list[list[list[mi.Float]]]) 
                 entry[channel] = value[channel] * of_channel[row][column]
             matrix[row, column] = entry
     return matrix
-
-
-def _projected(axis: mi.Vector3f, omega: mi.Vector3f) -> mi.Vector3f:
-    """Return the normalised component of a vector perpendicular to ω."""
-    return dr.normalize(axis - dr.dot(axis, omega) * omega)
 
 
 def _across(omega: mi.Vector3f) -> mi.Vector3f:

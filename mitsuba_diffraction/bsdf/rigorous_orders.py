@@ -52,23 +52,6 @@ class _Pair:
     above: tuple[mi.Bool, mi.Bool] | None
 
 
-@dataclass(eq=False)
-class _Position:
-    """The coordinates of an order of a pair in the table.
-
-    Attributes:
-        active: whether it propagates.
-        is_reversed: whether the table holds the reverse of the pair.
-        row: of the table.
-        nodes: of F, X and Z: the grid cell, and the coordinate in it.
-    """
-
-    active: mi.Bool
-    is_reversed: mi.Bool
-    row: mi.UInt32
-    nodes: list[tuple[mi.UInt32, mi.Float]]
-
-
 class RigorousOrders:
     """Σ_m η_m Γ N(q − m/T; σ_q² I), and the density Σ_m P_m N(q − m/T; σ_q² I) from which q is drawn.
 
@@ -137,7 +120,7 @@ class RigorousOrders:
         """
         frequency = incidence.frequency
         # Under a coat, the table is for directions and wavelengths inside of it.
-        k_i, k_o, index = geometry.incident, geometry.outgoing, geometry.coat_index
+        k_i, k_o, index = geometry.incident, geometry.outgoing, incidence.coat_index
         above = (k_i.sign > 0, k_o.sign > 0) if self.transmits else None
         pair = self._pair(k_i.tangent / index, k_o.tangent / index, index * frequency, above)
         order_0 = self._bin(incidence)
@@ -217,19 +200,19 @@ class RigorousOrders:
 
     def _matrix(self, m: mi.Int32, pair: _Pair, active: mi.Bool) -> list[mi.Vector4f]:
         """Return the rows of M of order m, linear between the nodes."""
-        position = self._position(m, pair, active)
+        table_row, nodes, is_reversed, active = self._position(m, pair, active)
         rows = [mi.Vector4f(0.0) for _ in range(4)]
         for corner in np.ndindex(2, 2, 2):
-            node, weight = position.row, mi.Float(1)
-            for (low, fraction), up, steps in zip(position.nodes, corner, self.axes.steps, strict=True):
+            node, weight = table_row, mi.Float(1)
+            for (low, fraction), up, steps in zip(nodes, corner, self.axes.steps, strict=True):
                 node = node * (steps + 1) + low + up
                 weight *= fraction if up else 1 - fraction
             for row in range(4):
-                rows[row] += weight * self.matrices(node * 4 + row, position.active)
+                rows[row] += weight * self.matrices(node * 4 + row, active)
         reversed_rows = [
             mi.Vector4f(*(float(REVERSED[i] * REVERSED[j]) * rows[j][i] for j in range(4))) for i in range(4)
         ]
-        return [dr.select(position.is_reversed, other, row) for row, other in zip(rows, reversed_rows, strict=True)]
+        return [dr.select(is_reversed, other, row) for row, other in zip(rows, reversed_rows, strict=True)]
 
     def sample(self, incidence: Incidence, u: mi.Float, v: mi.Point2f, active: mi.Bool) -> tuple[mi.Point2f, mi.Bool]:
         """Draw q in cycles/µm, for one wavelength; return it and whether its order propagates.
@@ -255,17 +238,22 @@ class RigorousOrders:
 
     def _efficiency(self, m: mi.Int32, pair: _Pair, active: mi.Bool) -> mi.Float:
         """Return η_m, linear between the nodes; 0 for an evanescent order."""
-        position = self._position(m, pair, active)
-        (i, f), (j, h), (k, w) = position.nodes
-        _, x_steps, z_steps = self.axes.steps
-        packet = self.table(((position.row * self.axes.steps[0] + i) * x_steps + j) * z_steps + k, position.active)
+        row, ((i, f), (j, h), (k, w)), _, active = self._position(m, pair, active)
+        f_steps, x_steps, z_steps = self.axes.steps
+        packet = self.table(((row * f_steps + i) * x_steps + j) * z_steps + k, active)
         # Along Z between the lower and the upper half of each word, then along X and F.
         along_z = [dr.lerp(mi.Float(mi.Int32(word & 0xFFFF)), mi.Float(mi.Int32(word >> 16)), w) for word in packet]
         found = dr.lerp(dr.lerp(along_z[0], along_z[1], h), dr.lerp(along_z[2], along_z[3], h), f)
-        return dr.select(position.active, found * (1 / MAX_STORED), 0)
+        return dr.select(active, found * (1 / MAX_STORED), 0)
 
-    def _position(self, m: mi.Int32, pair: _Pair, active: mi.Bool) -> _Position:
-        """Return the coordinates of order m in the table."""
+    def _position(
+        self, m: mi.Int32, pair: _Pair, active: mi.Bool
+    ) -> tuple[mi.UInt32, list[tuple[mi.UInt32, mi.Float]], mi.Bool, mi.Bool]:
+        """Return the coordinates of order m in the table.
+
+        They are the row; of F, X and Z the grid cell and the coordinate in it; whether the table holds the reverse of
+        the pair; and whether the order propagates.
+        """
         k_x = pair.c + 0.5 * mi.Float(m)
         whole = dr.round(k_x)
         n, a = mi.Int32(whole), dr.abs(k_x - whole)
@@ -300,7 +288,7 @@ class RigorousOrders:
             active &= channel < channels_of_side
             channels.append(channel + first)
         row = dr.select(active, start + channels[0] * count + channels[1], 0)
-        return _Position(active, is_reversed, row, nodes)
+        return row, nodes, is_reversed, active
 
     def _bin(self, incidence: Incidence) -> mi.Int32:
         """Return the index of order 0 in the bin of the sampler."""

@@ -17,10 +17,9 @@ from ..rigorous.spectrum import RigorousSpectrum
 from ..settings import VISIBLE
 from ..spectrum.grids import OrderGrid
 from .continuum import SplineSpectrum
-from .continuum_sampler import BinSampler
 from .energy import Energy
 from .order_sampler import OrderSampler
-from .orders import OrderSpectrum, OrderTable
+from .orders import OrderSpectrum
 from .parameters import Scales
 from .rigorous_orders import RigorousOrders
 
@@ -36,22 +35,21 @@ class SharedTables:
     """The tables of one spectrum for all BSDFs that have it, in one variant of Mitsuba.
 
     Attributes:
-        table: of resolved orders without their sampler, which depends on the scene; else the powers with their sampler.
+        table: the powers and their sampler; of resolved orders without the sampler, which depends on the scene.
         max_scale: the maximum lateral scale for which orders are resolved; None if they overlap without scaling.
     """
 
     def __init__(self, spectrum: Spectrum, eta: float | None) -> None:
-        self.table: OrderTable | OrderSpectrum | SplineSpectrum | RigorousOrders
-        self.max_scale: float | None = None
+        self.table: OrderSpectrum | SplineSpectrum | RigorousOrders
         if isinstance(spectrum, RigorousSpectrum):
             self.table = RigorousOrders(spectrum)
         else:
-            orders = OrderTable(spectrum) if isinstance(spectrum.grid, OrderGrid) else None
-            if orders is not None and orders.resolved:
-                self.table, self.max_scale = orders, orders.max_scale
-            else:
-                sampler = BinSampler(spectrum, None if eta is None else typical_max_kappa(eta))
-                self.table = SplineSpectrum(spectrum, sampler) if orders is None else OrderSpectrum(orders, sampler)
+            max_kappa = None if eta is None else typical_max_kappa(eta)
+            kind = OrderSpectrum if isinstance(spectrum.grid, OrderGrid) else SplineSpectrum
+            self.table = kind(spectrum, max_kappa)
+        self.max_scale: float | None = None
+        if isinstance(self.table, OrderSpectrum) and self.table.resolved:
+            self.max_scale = self.table.max_scale
         self._spectrum, self._eta = spectrum, eta
         self._energy: tuple[tuple, Energy | None] | None = None
         self._drawn: tuple[tuple, OrderSpectrum] | None = None
@@ -72,19 +70,18 @@ class SharedTables:
                 tables = _shared[key] = cls(spectrum, eta)
             return tables
 
-    def scattering(
-        self, scales: Scales, is_sheet: bool = False, coat_index: float = 1.0
-    ) -> OrderSpectrum | SplineSpectrum:
+    def scattering(self, scales: Scales, is_sheet: bool, coat_index: float) -> OrderSpectrum | SplineSpectrum:
         """Return the powers of scalar theory and their sampler, for the media and scales of a scene."""
-        if not isinstance(self.table, OrderTable):
-            return cast("OrderSpectrum | SplineSpectrum", self.table)
+        table = cast(OrderSpectrum | SplineSpectrum, self.table)
+        if not table.resolved:
+            return table
         low, high = scales.ratios()
         ratios = np.linspace(low, high, 1 if low == high else SAMPLER_RATIOS)
         key = is_sheet, coat_index, ratios.tolist(), scales.laterals
         with self._lock:
             if self._drawn is None or self._drawn[0] != key:
                 sampler = OrderSampler(cast(GratingSpectrum, self._spectrum), self._eta, *key)
-                self._drawn = key, OrderSpectrum(self.table, sampler)
+                self._drawn = key, cast(OrderSpectrum, table).drawn_by(sampler)
             return self._drawn[1]
 
     def energy(self, scales: Scales) -> Energy | None:

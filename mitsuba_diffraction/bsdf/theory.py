@@ -88,10 +88,12 @@ class Theory(Protocol):
         """
 
     def traverse(self, callback: mi.TraversalCallback) -> None:
-        """Show the parameters of the theory and of its material."""
+        """Show the parameters of the theory and of its material; none by default."""
+        return
 
     def parameters_changed(self, keys: list[str]) -> None:
-        """Recompute all that depends on the parameters `keys`, or on any parameter if there are none."""
+        """Recompute all that depends on the parameters `keys`, or on any if there are none; nothing by default."""
+        return
 
     def coordinates(self, geometry: Geometry) -> tuple[Coordinates, Coordinates] | None:
         """Return the coordinates of both directions in the table of E, for `evaluate` at all wavelengths; else None."""
@@ -241,7 +243,7 @@ class ScalarTheory(Theory):
     ) -> tuple[mi.Float, mi.Float]:
         power, density = self.scattering.evaluate(geometry, incidence, active)
         if pair is not None and self.energy is not None:
-            frequency = incidence.frequency * geometry.coat_index
+            frequency = incidence.frequency * incidence.coat_index
             power *= self.energy.factor(pair, frequency, geometry.height_scale)
         return power, density
 
@@ -299,12 +301,6 @@ class RigorousTheory(Theory):
                 f"wavelengths: got light of {first:g} to {last:g} nm and a rigorous spectrum of {shortest:g} to "
                 f"{longest:g} nm: build it for wavelengths=({first:g}, {last:g})"
             )
-
-    def parameters_changed(self, keys: list[str]) -> None:
-        """Do nothing: a table of efficiencies has no parameters."""
-
-    def traverse(self, callback: mi.TraversalCallback) -> None:
-        """Show no parameters."""
 
     def evaluate(
         self, geometry: Geometry, incidence: Incidence, pair: tuple[Coordinates, Coordinates] | None, active: mi.Bool
