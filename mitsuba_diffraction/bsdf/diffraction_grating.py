@@ -109,26 +109,16 @@ rotate it without reflecting it. The back of a `twosided` shows its mirror image
 first edge of each triangle and is discontinuous: add UVs. Where dp_du vanishes, Mitsuba chooses an axis.
 
 The BRDF is R · K · G · S(q; κ)/λ² · E, with q = −(ω_i + ω_o)_∥/λ along the pattern's axes and
-κ = 2π (cos θ_i + cos θ_o)/λ. R is the power reflectance at the half vector, K and G are those of `geometry.py`, and S
-is that of `orders.py` (orders) or `continuum.py` (a lattice). Orders have K and G of their own, and a gain Γ that
-compensates the part of a lobe below the horizon; a continuum has those of the pair of directions. E (`energy.py`)
-bounds the albedo by about one, and is one where the albedo without it is below one. Without shadowing there is no E, as
-K diverges as 1/cos θ near the horizon.
+κ = 2π (cos θ_i + cos θ_o)/λ. R is the power reflectance at the half vector (`fresnel.py`, with a film `thin_film.py`),
+K, G and the gain Γ of orders are those of `geometry.py`, S is that of `orders.py` (orders) or `continuum.py` (a
+lattice), and E (`energy.py`) bounds the albedo by about one. Without shadowing there is no E, as K diverges near the
+horizon. In rigorous theory the BRDF is Σ_m η_m Γ N(q − m/T; σ_q² I)/λ² (`rigorous_orders.py`).
 
-In rigorous theory the BRDF is Σ_m η_m Γ N(q − m/T; σ_q² I)/λ² (`rigorous_orders.py`): η_m includes R, K, G and E. With
-transmission the sum has the factor n_o², where n_o is the index of the medium of ω_o. The efficiencies of a sheet
-include the reflection by its flat face, as a lobe of order 0 (in scalar theory it is specular), and multiple
-reflections inside.
-
-With transmission (`geometry.py`), light is incident from above or below: q and κ contain the indices of both media,
-transmitted light has 1 − R instead of R, and its G is a different one (`geometry.k_g`). From below, the flat face of a
-sheet reflects specularly.
-
-A thin film on the relief (`thin_film.py`) changes R, and T, which is 1 − R without it. The phase e^{{iκh}} is the same
-at both of its faces.
-
-Under a coat (`coat.py`) all this holds for the wavelengths and directions inside it; its front face reflects
-specularly. A saved spectrum must cover the shorter wavelengths inside; one built from a recipe or a profile does.
+With transmission (`geometry.py`), light is incident from above or below; transmitted light has the factor n_o², where
+n_o is the index of the medium of ω_o, and T instead of R. The flat face of a sheet reflects light from below
+specularly; in rigorous theory its reflections are part of the efficiencies. Under a coat (`coat.py`) all this holds for
+the wavelengths and directions inside it, and its front face reflects specularly. A saved spectrum must cover the
+shorter wavelengths inside; one built from a recipe or a profile does.
 
 In polarised variants, scalar theory polarises as a plane perpendicular to the half vector does; rigorous theory uses
 the Mueller matrices of the orders. A perfect mirror depolarises.

@@ -10,7 +10,7 @@ K and G are those of each order where orders are evaluated one by one (`Geometry
 the pair of directions for continua (`Geometry.continuum_factor`).
 
 Where v_z → 0, which occurs in transmission, K diverges and S(q; κ) falls as κ². For |κ| < κ₁, v_z² in K is replaced by
-that of κ₁, and S by κ₁²/κ² S (`orders.small_kappa`).
+that of κ₁, and S by κ₁²/κ² S (`furnace.small_kappa`).
 """
 
 from __future__ import annotations
@@ -215,7 +215,7 @@ class Geometry:
         return dr.abs(self.v_z) * dr.two_pi * frequency * self.height_scale
 
     def small(self) -> tuple[mi.Float, mi.Bool]:
-        """Return κ₁, and the pairs to which it applies, for `orders.small_kappa`."""
+        """Return κ₁, and the pairs to which it applies, for `furnace.small_kappa`."""
         return self.min_kappa, ~self.reflects
 
     def cosines(self) -> tuple[mi.Float, mi.Float]:

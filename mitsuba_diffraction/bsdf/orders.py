@@ -11,6 +11,7 @@ import mitsuba as mi
 import numpy as np
 import scipy.special
 
+from ..energy.furnace import small_kappa
 from ..grating_spectrum import GratingSpectrum
 from ..spectrum.grids import LobeAxis, OrderGrid
 from ..spectrum.tables import HALF_SCALE, AmplitudeTable, SliceTable, shared_exponents
@@ -18,36 +19,13 @@ from .continuum_sampler import BinSampler
 from .geometry import Geometry, Incidence
 from .inversion import truncated_gaussian
 from .order_sampler import OrderSampler
-from .tables import HalfTable, PacketTable, SharedExponentTable, integer_part, larger, opaque
+from .tables import PacketTable, SharedExponentTable, integer_part, larger, opaque
 
 # Nodes are stored in squares of 4 × 4, so that a window of nodes of one word lies in one to four cache lines.
 _SQUARE_SIDE = 4
 
 # Of x, between nodes of the Bessel functions of a series; cubics interpolate these with an error up to step⁴/384.
 _MAX_BESSEL_STEP = 0.1
-
-
-Small = tuple["mi.Float", "mi.Bool"]
-"""κ₁ in rad/µm, and the pairs of directions to which `small_kappa` applies."""
-
-
-def small_kappa(
-    kappa: mi.Float, small: Small, factors: mi.Vector4f, first: mi.Vector4f, second: mi.Vector4f
-) -> mi.Vector4f:
-    """Return the factors of κ₁²/κ² c_m(κ) where κ < κ₁, elsewhere those of c_m(κ).
-
-    c_m of m ≠ 0 falls as κ² towards zero, below the absolute error of the table; therefore c_m/κ² is extrapolated
-    linearly from its values at κ₁ and 2κ₁.
-
-    Args:
-        kappa: κ in rad/µm.
-        small: κ₁, and the pairs of directions to which this applies.
-        factors, first, second: at κ, κ₁ and 2κ₁.
-    """
-    kappa_1, where = small
-    x = kappa / larger(kappa_1, 1e-30)
-    line = (2 - x) * first + 0.25 * (x - 1) * second
-    return dr.select(where & (kappa < kappa_1), line, factors)
 
 
 class _NodeTable:
@@ -108,13 +86,13 @@ class SlicePower(_NodeTable):
         values = self._arranged(table.values)
         words = table.words_per_node
         scale = 1.0
-        packets: SharedExponentTable | HalfTable | PacketTable
+        packets: SharedExponentTable | PacketTable
         if words == 1:
             mantissas, exponents = shared_exponents(values)
             packets = SharedExponentTable(np.moveaxis(mantissas, 1, -1), exponents)
         elif words == 2:
             scale = HALF_SCALE
-            packets = HalfTable(np.moveaxis(values, 1, -1) * np.float32(scale))
+            packets = PacketTable((np.moveaxis(values, 1, -1) * np.float32(scale)).astype(np.float16))
         else:
             padded = np.pad(values, ((0, 0), (0, 4 - table.terms), (0, 0)))
             packets = PacketTable(np.moveaxis(padded, 1, -1))
@@ -151,17 +129,17 @@ class SlicePower(_NodeTable):
             packet = dr.fma(weight, row_sum, packet)
         return dr.dot(packet, factors)
 
-    def at(self, kappa: mi.Float, small: Small) -> tuple[mi.UInt32, mi.Vector3f | mi.Vector4f]:
+    def at(self, kappa: mi.Float, small: tuple[mi.Float, mi.Bool]) -> tuple[mi.UInt32, mi.Vector3f | mi.Vector4f]:
         """Return the index of node 0 at κ (rad/µm), and the factors of the components of a packet.
 
-        `small` as of `small_kappa`; κ₁ is at most half of the first interval.
+        `small` is from `Geometry.small`; κ₁ is at most half of the first interval.
         """
         x = kappa * self.per_kappa
         interval = dr.minimum(integer_part(x), self.intervals - 1)
         factors = self._factors(2 * (x - mi.Float(mi.Int32(interval))) - 1)
-        first, second = (self._factors(2 * n * small[0] * self.per_kappa - 1) for n in (1, 2))
-        factors = small_kappa(kappa, small, factors, first, second)
-        return interval * self.nodes, factors
+        kappa_1, where = small
+        first, second = (self._factors(2 * n * kappa_1 * self.per_kappa - 1) for n in (1, 2))
+        return interval * self.nodes, small_kappa(kappa, kappa_1, factors, first, second, where, dr.select)
 
     def _factors(self, t: mi.Float) -> mi.Vector3f | mi.Vector4f:
         """Return the powers of t."""
@@ -197,7 +175,7 @@ class AmplitudePower(_NodeTable):
             packets[:, 0, 1::2] *= 2
             self.factors = PacketTable(packets)
 
-    def at(self, kappa: mi.Float, small: Small) -> tuple[mi.Float, mi.Float]:
+    def at(self, kappa: mi.Float, small: tuple[mi.Float, mi.Bool]) -> tuple[mi.Float, mi.Float]:
         """Return κ, and the factor of the power: κ₁²/κ² where `small` applies and κ < κ₁; a series is exact there."""
         kappa_1, where = small
         where = where & (kappa < kappa_1)

@@ -52,10 +52,10 @@ class NumberTable:
     """A flat table of numbers."""
 
     def __init__(self, numbers: np.ndarray) -> None:
-        """Flatten an array; numbers other than uint32 are converted to float32."""
-        whole = numbers.dtype == np.uint32
-        self.number = mi.UInt32 if whole else mi.Float
-        self.values = self.number(aligned(numbers.ravel() if whole else np.asarray(numbers, np.float32).ravel()))
+        """Flatten an array; numbers other than uint32 and float16 are converted to float32."""
+        kind = numbers.dtype if numbers.dtype in (np.uint32, np.float16) else np.float32
+        self.number = {np.uint32: mi.UInt32, np.float16: mi.Float16, np.float32: mi.Float}[np.dtype(kind).type]
+        self.values = self.number(aligned(np.asarray(numbers, kind).ravel()))
 
     def __call__(self, index: mi.UInt32, active: mi.Bool = True) -> mi.Float | mi.UInt32:
         """Return the numbers at `index`; zero where not `active`."""
@@ -63,7 +63,7 @@ class NumberTable:
 
 
 class PacketTable(NumberTable):
-    """A flat table of packets of two or four floats, or four uint32; one packet is one read of 8 or 16 bytes."""
+    """A flat table of packets of four numbers, or two floats; one packet is one read of 8 or 16 bytes."""
 
     unit = 1.0
 
@@ -72,7 +72,7 @@ class PacketTable(NumberTable):
         super().__init__(packets)
         self.width = width
         floats = {2: mi.Vector2f, 4: mi.Vector4f}[width]
-        self.packet = mi.Vector4u if packets.dtype == np.uint32 else floats
+        self.packet = {mi.UInt32: mi.Vector4u, mi.Float16: mi.Array4f16}.get(self.number, floats)
 
     def __call__(self, index: mi.UInt32, active: mi.Bool | bool = True) -> Any:
         """Return the packets at `index`; zero where not `active`."""
@@ -80,7 +80,7 @@ class PacketTable(NumberTable):
 
     def add(self, packet: mi.Vector4f, weight: mi.Float, index: mi.UInt32, active: mi.Bool) -> mi.Vector4f:
         """Return `packet` plus `weight` times the packet at `index`."""
-        return dr.fma(weight, self(index, active), packet)
+        return dr.fma(weight, mi.Vector4f(self(index, active)), packet)
 
     def component(self, index: mi.UInt32, component: mi.UInt32, active: mi.Bool) -> mi.Float:
         """Return one component of the packet at `index`; zero where not `active`."""
@@ -98,20 +98,6 @@ def aligned(values: np.ndarray) -> np.ndarray:
     result = memory[start : start + values.nbytes].view(values.dtype)
     result[:] = values
     return result
-
-
-class HalfTable:
-    """A flat table of packets of four numbers in half precision; one packet is one read of 8 bytes."""
-
-    unit = 1.0
-
-    def __init__(self, packets: np.ndarray) -> None:
-        """Flatten packets of four numbers, the last axis, in half precision."""
-        self.values = mi.Float16(aligned(np.ascontiguousarray(packets, np.float16).ravel()))
-
-    def add(self, packet: mi.Vector4f, weight: mi.Float, index: mi.UInt32, active: mi.Bool) -> mi.Vector4f:
-        """Return `packet` plus `weight` times the packet at `index`."""
-        return dr.fma(weight, mi.Vector4f(dr.gather(mi.Array4f16, self.values, index, active)), packet)
 
 
 class SharedExponentTable:

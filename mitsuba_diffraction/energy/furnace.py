@@ -26,15 +26,17 @@ below, the surface has the heights −h. A sheet uses the tables of an interface
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass, field
 from functools import cache
+from typing import Any
 
 import numpy as np
 from numpy.polynomial.legendre import leggauss
 from numpy.typing import ArrayLike, NDArray
 from scipy.interpolate import CubicSpline
 
-from ..geometry import fresnel, horizon_gain, k_g, transmitted
+from ..geometry import Array, fresnel, horizon_gain, k_g, transmitted
 from ..spectrum.grids import OrderGrid
 from ..spectrum.power_spectrum import PowerSpectrum
 
@@ -260,10 +262,29 @@ def small_kappas(spectrum: PowerSpectrum, index: float) -> tuple[float, float]:
     return spectrum.table.first_interval / 4, 1.6 * np.pi * abs(index - 1) / max_wavelength
 
 
-def small_kappa(kappa: Real, first: float, power: NDArray, at_first: NDArray, at_second: NDArray) -> Real:
-    """Return c_m(κ) = `power` above κ₁ = `first`; below, κ₁²/κ² c_m(κ), with c_m/κ² linear through κ₁ and 2κ₁."""
-    x = kappa / max(first, 1e-30)
-    return np.where(kappa < first, (2 - x) * at_first + 0.25 * (x - 1) * at_second, power)
+def small_kappa(
+    kappa: Array,
+    first: Array,
+    power: Array,
+    at_first: Array,
+    at_second: Array,
+    where: Array = True,
+    select: Callable[..., Any] = np.where,
+) -> Array:
+    """Return c_m(κ), and κ₁²/κ² c_m(κ) where κ < κ₁ = `first`.
+
+    c_m of m ≠ 0 falls as κ² towards zero, below the absolute error of the table; therefore c_m/κ² is extrapolated
+    linearly from its values at κ₁ and 2κ₁.
+
+    Args:
+        kappa: κ in rad/µm.
+        first: κ₁ in rad/µm.
+        power, at_first, at_second: c_m, or the factors of c_m, at κ, κ₁ and 2κ₁.
+        where: the pairs of directions to which this applies.
+        select: `numpy.where` or `drjit.select`.
+    """
+    x = kappa / select(first > 1e-30, first, 1e-30)
+    return select(where & (kappa < first), (2 - x) * at_first + 0.25 * (x - 1) * at_second, power)
 
 
 def mean_cosine(square: ArrayLike, sigma: ArrayLike) -> Real:

@@ -9,7 +9,7 @@ import numpy as np
 from ..bsdf.base import nested_plugin
 from ..errors import RequestError
 from ..manual import Parameter, listed
-from .paths import Gratings, LightPaths, define_eye_paths, implements
+from .paths import Gratings, LightPaths, define_eye_paths, implements, unpacked
 
 PARAMETERS = (
     Parameter("max_depth", "integer", "as in `path`: 2 is direct light, 3 a rainbow on a wall; −1 is no limit", "−1"),
@@ -173,9 +173,10 @@ def _add_light_paths(sensor: mi.Sensor, light: LightPaths, seed: mi.UInt32 | int
     block = film.create_block()
     corner = mi.Vector2f(film.crop_offset())
     for splats in light.splats(seed, light.count(spp)):
-        position, value = splats.position + corner, splats.value * spp
+        position, wavelengths, value = unpacked(splats)
         if mi.has_flag(film.flags(), mi.FilmFlags.Special):
-            block.put(position, film.prepare_sample(value, splats.wavelengths, block.channel_count(), 0.0, 0.0))
+            sample = film.prepare_sample(value * spp, wavelengths, block.channel_count(), 0.0, 0.0)
+            block.put(position + corner, sample)
         else:
-            block.put(position, splats.wavelengths, value, 0.0, 0.0)
+            block.put(position + corner, wavelengths, value * spp, 0.0, 0.0)
     film.put_block(block)

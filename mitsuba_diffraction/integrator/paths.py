@@ -6,12 +6,12 @@ The manual of `diffraction_path` lists which paths are traced from which end.
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterator
-from dataclasses import dataclass
+from collections.abc import Callable, Iterable, Iterator
 
 import drjit as dr
 import mitsuba as mi
 import numpy as np
+from numpy.typing import NDArray
 
 from ..bsdf.base import gratings_in, is_grating, parts
 
@@ -229,22 +229,6 @@ def _power_heuristic(a: mi.Float, b: mi.Float) -> mi.Float:
 # ---------------------------------------------------------------- from the light
 
 
-@dataclass(frozen=True, eq=False)
-class Splats:
-    """n contributions, n ≥ 1.
-
-    Attributes:
-        position: pixels from the corner of the crop window.
-        wavelengths: four, drawn by the sensor, nm.
-        value: Σ value δ(x − position) over all splats has the expectation L(x), x in pixels, in the form in which the
-            sensor gives radiance to the film: divided by the density of the wavelengths and times the film's response.
-    """
-
-    position: mi.Point2f
-    wavelengths: mi.Spectrum
-    value: mi.Spectrum
-
-
 class SplatBuffer:
     """Buffer for the contributions of paths, any number of each, from inside a recorded loop.
 
@@ -261,13 +245,12 @@ class SplatBuffer:
         self._path, self._vertex = dr.empty(mi.UInt32, capacity), dr.empty(mi.UInt32, capacity)
         dr.make_opaque(self._count)
 
-    def add(self, splats: Splats, path: mi.UInt32, vertex: mi.UInt32, active: mi.Bool) -> None:
-        """Add the contribution of a path at one of its vertices."""
+    def add(self, splat: Iterable[mi.Float], path: mi.UInt32, vertex: mi.UInt32, active: mi.Bool) -> None:
+        """Add the contribution of a path at one of its vertices: position, wavelengths, value."""
         slot = dr.scatter_inc(self._count, mi.UInt32(0), active)
         active = active & (slot < dr.opaque(mi.UInt32, self.capacity))
-        values = (*splats.position, *splats.wavelengths, *splats.value)
-        for column, value in zip(self._columns, values, strict=True):
-            dr.scatter(column, value, slot, active)
+        for column, number in zip(self._columns, splat, strict=True):
+            dr.scatter(column, number, slot, active)
         dr.scatter(self._path, path, slot, active)
         dr.scatter(self._vertex, vertex, slot, active)
 
@@ -276,16 +259,18 @@ class SplatBuffer:
         dr.eval(self._count, self._columns, self._path, self._vertex)
         return int(self._count[0])
 
-    def content(self) -> list[Splats]:
+    def content(self) -> NDArray[np.float32]:
         """Return all contributions; their number must not exceed `capacity`."""
         count = self.count()
-        if count == 0:
-            return []
         order = np.lexsort((np.array(self._vertex)[:count], np.array(self._path)[:count]))
-        columns = [dr.gather(mi.Float, column, mi.UInt32(order)) for column in self._columns]
-        channels = dr.size_v(mi.Spectrum)
-        position, wavelengths, value = columns[:2], columns[2 : 2 + channels], columns[2 + channels :]
-        return [Splats(mi.Point2f(position), mi.Spectrum(wavelengths), mi.Spectrum(value))]
+        return np.stack([np.array(column)[order] for column in self._columns], axis=1)
+
+
+def unpacked(splats: NDArray[np.float32]) -> tuple[mi.Point2f, mi.Spectrum, mi.Spectrum]:
+    """Return positions, wavelengths and values of contributions, see `LightPaths.splats`."""
+    x, y, *rest = (mi.Float(np.ascontiguousarray(column)) for column in splats.T)
+    half = len(rest) // 2
+    return mi.Point2f(x, y), mi.Spectrum(rest[:half]), mi.Spectrum(rest[half:])
 
 
 _MAX_PATHS_PER_LAUNCH = 2**20  # some 150 MB
@@ -324,8 +309,13 @@ class LightPaths:
         """Return the number of paths for `spp` samples per pixel."""
         return max(1, round(_LIGHT_PATHS_PER_SAMPLE * spp * self.pixels))
 
-    def splats(self, seed: mi.UInt32 | int, count: int) -> Iterator[Splats]:
-        """Trace `count` paths. The contributions and their order depend on the seed and the count alone."""
+    def splats(self, seed: mi.UInt32 | int, count: int) -> Iterator[NDArray[np.float32]]:
+        """Trace `count` paths; yield contributions, (n, 10). They and their order depend on seed and count alone.
+
+        Each is a position x in pixels from the corner of the crop window, four wavelengths in nm, drawn by the sensor,
+        and their values: Σ value δ(x − position) has the expectation L(x), in the form in which the sensor gives
+        radiance to the film: divided by the density of the wavelengths and times the film's response.
+        """
         capacity = min(_MAX_PATHS_PER_LAUNCH, count)
         for first in range(0, count, _MAX_PATHS_PER_LAUNCH):
             paths = min(_MAX_PATHS_PER_LAUNCH, count - first)
@@ -336,7 +326,8 @@ class LightPaths:
                 capacity = buffer.count()
                 buffer = SplatBuffer(capacity)
                 self._trace(seed, first, paths, self.pixels / count, buffer)
-            yield from buffer.content()
+            if buffer.count() > 0:
+                yield buffer.content()
 
     @dr.syntax
     def _trace(self, seed: mi.UInt32 | int, first: int, count: int, scale: float, buffer: SplatBuffer) -> None:
@@ -359,7 +350,7 @@ class LightPaths:
             on_grating, grating_only = self.gratings.classify(si, active)
             on_other = active & (on_grating ^ True)
             position, value, connected = self._connect(si, bsdf, _next_2d(rng), on_other)
-            buffer.add(Splats(position, ray.wavelengths, value * power * throughput), path, depth, connected)
+            buffer.add((*position, *ray.wavelengths, *(value * power * throughput)), path, depth, connected)
             ray, weight, _ = self._scatter(si, bsdf, power * throughput, grating_only, rng, active)
             throughput *= weight
             depth += 1

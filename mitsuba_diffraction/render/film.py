@@ -24,7 +24,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..errors import RequestError, root_cause
-from ..integrator.paths import LightPaths
+from ..integrator.paths import LightPaths, unpacked
 from .scene import channel_wavelengths, channel_weights, recorded_range, wavelengths_of
 
 Rows = tuple[int, int]
@@ -215,9 +215,9 @@ def trace_with_mitsubas_film(scene: mi.Scene, integrator: mi.Integrator, spp: in
 
 
 class LightOfBands:
-    """Contributions of the paths from the light of one pass, by band, in temporary files if they are many.
+    """Contributions of the paths from the light of one pass (`LightPaths.splats`), by band, in the order of tracing.
 
-    Each is a row of float32, in the order of tracing: position on the film (x, y), wavelengths, values.
+    They are in temporary files if they are many.
     """
 
     def __init__(self, bands: tuple[Rows, ...]) -> None:
@@ -231,8 +231,7 @@ class LightOfBands:
         if self._traced != (spp, seed):
             self.__del__()
             self._files = [tempfile.SpooledTemporaryFile(_SPOOLED_BYTES) for _ in self.bands]  # noqa: SIM115
-            for splats in light.splats(seed, light.count(spp)):
-                traced = np.stack([np.array(x) for x in (*splats.position, *splats.wavelengths, *splats.value)], axis=1)
+            for traced in light.splats(seed, light.count(spp)):
                 self._columns = traced.shape[1]
                 for (first, end), file in zip(self.bands, self._files, strict=True):
                     row = traced[:, 1]
@@ -337,18 +336,15 @@ def _add_light(
     _, above, below = margins
     row = np.clip(np.floor(splats[:, 1]).astype(np.int64) + above, 0, rows + above + below - 1)
     pixel = row * columns + np.clip(splats[:, 0].astype(np.int64), 0, columns - 1)
-    ordered = splats[np.argsort(pixel, kind="stable")].T
-    x, y, *rest = (mi.Float(np.ascontiguousarray(column)) for column in ordered)
+    position, wavelengths, value = unpacked(splats[np.argsort(pixel, kind="stable")])
     counts = np.bincount(pixel, minlength=(rows + above + below) * columns)
     starts = mi.UInt32(np.concatenate([[0], counts.cumsum()]))
-    half = len(rest) // 2
-    channel, value = _on_channels(film, mi.Spectrum(rest[:half]), mi.Spectrum(rest[half:]) * dr.opaque(mi.Float, spp))
+    channel, value = _on_channels(film, wavelengths, value * dr.opaque(mi.Float, spp))
 
     def range_of_pixel(index: mi.UInt32, active: mi.Bool) -> tuple[mi.UInt32, mi.UInt32]:
         return dr.gather(mi.UInt32, starts, index, active), dr.gather(mi.UInt32, starts, index + 1, active)
 
-    position, shape = mi.Point2f(x, y), (rows, columns)
-    added = collect(film.rfilter(), position, channel, value, shape, margins, range_of_pixel, channels - 1)
+    added = collect(film.rfilter(), position, channel, value, (rows, columns), margins, range_of_pixel, channels - 1)
     sums[..., :-1] += np.array(added).reshape(sums.shape)[..., :-1]
 
 
