@@ -138,11 +138,10 @@ def sample(
     """Sample a BSDF.
 
     Args:
-        bsdf: of the current variant.
+        bsdf, context: as of `evaluate_pdf`.
         wi: ω_i, (n, 3), for one sample each.
         wavelengths: (c,) or (n, c) in nm, as many as a ray has.
         seed: of the random numbers.
-        context: the components of the BSDF; all by default.
         uv: (n, 2) or (2,).
 
     Returns:

@@ -37,14 +37,11 @@ class SplineSpectrum:
         self.sampler = BinSampler(spectrum, typical_max_kappa)
 
     def meets(self, q_x: mi.Float, q_y: mi.Float, scale: mi.Float | float) -> mi.Bool:
-        """Return true: a continuum has no gaps."""
+        """As `Scattering.meets`: a continuum has no gaps."""
         return mi.Bool(True)
 
     def evaluate(self, geometry: Geometry, incidence: Incidence, active: mi.Bool) -> tuple[mi.Float, mi.Float]:
-        """Evaluate n_o² K G S(q; κ) |cos θ_o| and the density of q, both in µm², as `Scattering.evaluate`.
-
-        K and G are those of the pair of directions (`Geometry.continuum_factor`), as no order is known.
-        """
+        """As `Scattering.evaluate`, with K and G of the pair of directions (`Geometry.continuum_factor`)."""
         q = geometry.tangent * incidence.frequency
         x, y = q.x * self.per_q_x, q.y * self.per_q_y
         m_x, m_y = mi.Int32(dr.round(x)), mi.Int32(dr.round(y))
@@ -66,5 +63,5 @@ class SplineSpectrum:
         return dr.select(inside, power, 0), self.sampler.density(incidence.q_sign * q, incidence, active)
 
     def sample(self, incidence: Incidence, u: mi.Float, v: mi.Point2f, active: mi.Bool) -> tuple[mi.Point2f, mi.Bool]:
-        """Draw q in cycles/µm, for one wavelength; as no order is chosen, none is evanescent."""
+        """As `Scattering.sample`; as no order is chosen, none is evanescent."""
         return self.sampler.sample(incidence, u, v, active), active

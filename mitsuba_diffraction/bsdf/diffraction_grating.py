@@ -41,7 +41,7 @@ PARAMETERS = (
         "theory",
         "string",
         "for a profile: scalar, or rigorous, Maxwell's equations for line gratings in the given material; files and "
-        "spectra specify their own. Rigorous theory refuses height_scale, lateral_scale, shadowing, fresnel and base",
+        "spectra specify their own. Rigorous theory refuses height_scale, lateral_scale, shadowing and base",
         "scalar",
     ),
     Parameter("int_ior, ext_ior", "float or string", "a dielectric, as in Mitsuba's `dielectric`", "1.5, air"),
@@ -125,39 +125,29 @@ the Mueller matrices of the orders. A perfect mirror depolarises.
 """
 
 
-def refuse_unknown(props: mi.Properties) -> None:
-    """Check the names of all parameters but nested BSDFs, before anything is computed.
+def refuse_wrong(props: mi.Properties) -> None:
+    """Check the names and the types of all parameters, before anything is computed.
 
     Raises:
-        RequestError: with the known names, if one is unknown.
-    """
-    known = {name for parameter in PARAMETERS for name in parameter.name.split(", ")}
-    if "profile" in props:
-        if (profile := props["profile"]) not in PROFILES:
-            return  # `surface_from` lists them
-        known.update(parameters_of_profile(profile))
-    nested = {name for name, value in props.objects() if isinstance(value, mi.BSDF)}
-    if unknown := sorted(set(props.keys()) - known - nested):
-        raise RequestError(f"{', '.join(unknown)}: unknown, wanted one of {', '.join(sorted(known))}")
-
-
-def refuse_other_types(props: mi.Properties) -> None:
-    """Check that no parameter is a colour, a vector or a spectrum, nor an object where it must be a number or a text.
-
-    Raises:
-        RequestError: if one is.
+        RequestError: with the known names, if one is unknown; if one is a colour, a vector or a spectrum, or an object
+            where it must be a number or a text.
     """
     types = {name: parameter.type for parameter in PARAMETERS for name in parameter.name.split(", ")}
-    kinds, objects = mi.Properties.Type, dict(props.objects())
+    kinds, objects, profile = mi.Properties.Type, dict(props.objects()), props.get("profile")
+    nested = {name for name, value in objects.items() if isinstance(value, mi.BSDF)}  # `base_from` names others
+    # `surface_from` lists the profiles.
+    known = {*types, *(parameters_of_profile(profile) if profile in PROFILES else ())}
+    if profile in (None, *PROFILES) and (unknown := sorted(set(props.keys()) - known - nested)):
+        raise RequestError(f"{', '.join(unknown)}: unknown, wanted one of {', '.join(sorted(known))}")
     for name in props.keys():  # noqa: SIM118
-        kind, wanted, value = props.type(name), types.get(name, "float or string"), objects.get(name)
-        is_base = isinstance(value, mi.BSDF) and ("BSDF" in wanted or name not in types)  # `base_from` names others
-        is_texture = isinstance(value, mi.Texture) and "texture" in wanted
+        kind, wanted = props.type(name), types.get(name, "float or string")
+        is_base = name in nested and ("BSDF" in wanted or name not in types)
+        is_texture = isinstance(objects.get(name), mi.Texture) and "texture" in wanted
         # Vectors are refused as other numbers and names are.
         is_vector = kind == kinds.Vector and (wanted in ("float", "float or string") or name == "material")
         is_plain = kind in (kinds.Bool, kinds.Integer, kinds.Float, kinds.String)
         if not (is_plain or is_base or is_texture or is_vector):
-            got = kind.name.lower() if value is None else type(value).__name__
+            got = type(objects[name]).__name__ if name in objects else kind.name.lower()
             raise RequestError(f"{name}: got a {got}, wanted {wanted}")
 
 
@@ -168,8 +158,7 @@ def check(props: mi.Properties) -> None:
         RequestError: if a name is unknown or a value wrong.
         FileNotFoundError: if there is no such file.
     """
-    refuse_unknown(props)
-    refuse_other_types(props)
+    refuse_wrong(props)
     base_from(props)
     surface = GratingRequest.of(props).surface
     if isinstance(surface, Recipe):
@@ -185,8 +174,7 @@ def define() -> type:
         def __init__(self, props: mi.Properties) -> None:
             # The initialiser of the base class registers the object, which Dr.Jit then calls in all scenes as long as
             # it exists, even if only a traceback refers to it: therefore errors must occur before.
-            refuse_unknown(props)
-            refuse_other_types(props)
+            refuse_wrong(props)
             self.layers = Layers(props)
             self.spectrum = self.layers.grating.spectrum
             mi.BSDF.__init__(self, props)

@@ -306,23 +306,18 @@ class OrderSpectrum:
         return result
 
     def meets(self, q_x: mi.Float, q_y: mi.Float, scale: mi.Float | float) -> mi.Bool:
-        """Return whether q (cycles/µm) lies in the lobe, scaled by `scale`, of an order; true where lobes overlap."""
+        """As `Scattering.meets`."""
         if not self.resolved:
             return mi.Bool(True)
         along_x, along_y = self.axes
         return along_x.contains(along_x.first(q_x), q_x, scale) & along_y.contains(along_y.first(q_y), q_y, scale)
 
     def evaluate(self, geometry: Geometry, incidence: Incidence, active: mi.Bool) -> tuple[mi.Float, mi.Float]:
-        """Evaluate n_o² K G S(q; κ) |cos θ_o| and the density of q, both in µm², for one wavelength.
+        """As `Scattering.evaluate`.
 
         For resolved orders, and for all orders of line gratings, K and G are those of each order, with the gain of its
-        lobe (`Geometry.order_squares_and_gain`). For other tiles they are those of the pair of directions
+        lobe (`Geometry.order_factor`). For other tiles they are those of the pair of directions
         (`Geometry.continuum_factor`).
-
-        Args:
-            geometry: of the pair of directions.
-            incidence: the wavelength and the incident direction.
-            active: mask; where orders are resolved, q lies in the lobe of one (`meets`).
         """
         scale = incidence.lobe_scale
         q = geometry.tangent * incidence.frequency
@@ -365,7 +360,7 @@ class OrderSpectrum:
         return mi.Vector2f(mi.Float(m_x) * along_x.pitch, mi.Float(m_y) * along_y.pitch) * wavelength
 
     def sample(self, incidence: Incidence, u: mi.Float, v: mi.Point2f, active: mi.Bool) -> tuple[mi.Point2f, mi.Bool]:
-        """Draw q in cycles/µm, for one wavelength; return it and whether its order propagates."""
+        """As `Scattering.sample`."""
         if isinstance(self.sampler, BinSampler):
             return self.sampler.sample(incidence, u, v, active), active
         m_x, m_y = self.sampler.sample(incidence, u, active)

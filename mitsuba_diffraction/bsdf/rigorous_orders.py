@@ -92,7 +92,7 @@ class RigorousOrders:
         self.shortest, self.longest = (opaque(w) for w in axes.wavelengths)
 
     def meets(self, q_x: mi.Float, q_y: mi.Float, scale: float = 1.0) -> mi.Bool:
-        """Return whether q (cycles/µm) lies in the lobe of an order; the lateral scale is one."""
+        """As `Scattering.meets`; the lateral scale is one."""
         return (mi.Float(self._first(q_x)) * self.pitch - q_x <= self.half_width) & (dr.abs(q_y) <= self.half_width)
 
     def _first(self, q_x: mi.Float) -> mi.Int32:
@@ -109,15 +109,7 @@ class RigorousOrders:
             yield m, dr.square(offset) + dr.square(pair.q_y), in_lobe
 
     def evaluate(self, geometry: Geometry, incidence: Incidence, active: mi.Bool) -> tuple[mi.Float, mi.Float]:
-        """Return n_o² |cos θ_o| Σ_m η_m Γ N and the density of q, both in µm², for one wavelength.
-
-        Γ is the gain of `Geometry.order_squares_and_gain`.
-
-        Args:
-            geometry: of the pair of directions, along the pattern's axes.
-            incidence: the wavelength and the incident direction.
-            active: mask; q lies in the lobe of an order (`meets`).
-        """
+        """As `Scattering.evaluate`, with the gain Γ of `Geometry.order_squares_and_gain`."""
         frequency = incidence.frequency
         # Under a coat, the table is for directions and wavelengths inside of it.
         k_i, k_o, index = geometry.incident, geometry.outgoing, incidence.coat_index
@@ -132,9 +124,8 @@ class RigorousOrders:
             power += lobe * gain * self._efficiency(m, pair, in_lobe)
             # Evanescent orders are not drawn.
             in_lobe &= incidence.propagates(tangent)
-            density += (
-                dr.select(in_lobe, lobe, 0) * self.orders(mi.UInt32(dr.select(in_lobe, order_0 + m, 0)), in_lobe).y
-            )
+            index = mi.UInt32(dr.select(in_lobe, order_0 + m, 0))
+            density += dr.select(in_lobe, lobe, 0) * self.orders(index, in_lobe).y
         return power * geometry.factor, density / PROBABILITY_UNITS
 
     def _pair(
@@ -215,12 +206,8 @@ class RigorousOrders:
         return [dr.select(is_reversed, other, row) for row, other in zip(rows, reversed_rows, strict=True)]
 
     def sample(self, incidence: Incidence, u: mi.Float, v: mi.Point2f, active: mi.Bool) -> tuple[mi.Point2f, mi.Bool]:
-        """Draw q in cycles/µm, for one wavelength; return it and whether its order propagates.
-
-        `u` chooses the order, `v` the position in its lobe.
-        """
-        order_0 = self._bin(incidence)
-        max_order = self.max_order
+        """As `Scattering.sample`."""
+        order_0, max_order = self._bin(incidence), self.max_order
 
         def cumulative(m: mi.Int32) -> mi.Float:
             return self.orders(mi.UInt32(order_0 + m), active).x

@@ -54,11 +54,14 @@ class Scattering(Protocol):
         """Return the power and the density of q, both in µm², for one wavelength of a pair of directions.
 
         The power is n_o² K G S |cos θ_o|, with the gain of lobes, or n_o² Σ_m η_m Γ N |cos θ_o| in rigorous theory.
-        Where orders are resolved, q lies in the lobe of one.
+        Where orders are resolved, q lies in the lobe of one for all `active` pairs.
         """
 
     def sample(self, incidence: Incidence, u: mi.Float, v: mi.Point2f, active: mi.Bool) -> tuple[mi.Point2f, mi.Bool]:
-        """Draw q in cycles/µm for one wavelength; return it and whether its order propagates."""
+        """Draw q in cycles/µm for one wavelength; return it and whether its order propagates.
+
+        `u` chooses the order, or a bin of κ and q; `v` the position in its lobe or bin.
+        """
 
 
 class Theory(Protocol):
@@ -155,23 +158,19 @@ class ScalarTheory(Theory):
         self.update()
 
     def cover(self, wavelengths: tuple[float, float]) -> None:
-        self.light, before = wavelengths, self.light
-        try:
-            self.update()
-        except RequestError:
-            self.light = before
-            raise
+        self.update(wavelengths)
 
-    def update(self) -> None:
-        """Check the parameters that can change, and recompute what depends on them.
+    def update(self, light: tuple[float, float] | None = None) -> None:
+        """Check the parameters that can change, and recompute what depends on them and on the light, if it is given.
 
         Raises:
             RequestError: if the spectrum does not cover the scales, or the wavelengths of the light.
         """
-        index, (first, last) = self.media.index, self.light or VISIBLE
+        light = light or self.light
+        index, (first, last) = self.media.index, light or VISIBLE
         shortest = first / index
         # Without a scene nobody knows whether there is light at the wavelengths before the first of the spectrum.
-        if (index > 1 or self.light) and shortest < self.spectrum.wavelengths[0] * (1 - 1e-6):
+        if (index > 1 or light) and shortest < self.spectrum.wavelengths[0] * (1 - 1e-6):
             name, medium = "int_ior", "the material"
             if self.media.eta is None:
                 name, medium = ("ext_ior", "it") if self.media.coat is None else ("coat_ior", "the coat")
@@ -182,6 +181,7 @@ class ScalarTheory(Theory):
                 f"{got}, and a spectrum for wavelengths from {self.spectrum.wavelengths[0]:g} nm{why}: build it from "
                 f"{shortest:.4g} nm"
             )
+        self.light = light
         # The longest wavelength grows as the index falls.
         self.spectrum = self.spectrum.up_to(last / index)
         self.tables = SharedTables.of(self.spectrum, self.media.eta)

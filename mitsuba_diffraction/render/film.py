@@ -5,8 +5,7 @@ their order, the result is not reproducible when several threads contribute to a
 pixel, and with the box filter if the samples of a pixel are split among threads. Here the samples are stored, and each
 pixel gathers its own in a fixed order, independent of the number of threads.
 
-This is also faster: four wavelengths contribute to at most eight of the hat-shaped channels, whereas a `specfilm` adds
-to all 93 for each sample and each pixel under the filter.
+Four wavelengths contribute to at most eight of the hat-shaped channels; a `specfilm` adds each sample to all of them.
 """
 
 from __future__ import annotations
@@ -74,8 +73,7 @@ def trace_pass(
     (`rotated`), so that the expectation of any pass is that of independent samples.
 
     The result is determined, bit for bit, by the seed, the scene, the versions of Mitsuba and Dr.Jit and the type of
-    processor, not by the number of threads. Scalar variants and Mitsuba's differentiable integrators (`prb`, ...) use
-    Mitsuba's film and are not reproducible in the last bits.
+    processor. Integrators that need Mitsuba's film (`needs_mitsubas_film`) are not reproducible in the last bits.
 
     Args:
         scene: from `load_spectral_scene`.

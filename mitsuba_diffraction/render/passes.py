@@ -453,19 +453,15 @@ def render(
 ) -> SpectralImage:
     """Render the first sensor of a scene spectrally, with its own integrator, in the current variant.
 
-    The samples are split into passes with independent seeds, which are added in float64 in the order of their indices.
-    The same seed therefore gives the same bits (within the limits of `trace_pass`), whether the rendering was
-    interrupted or not, on one machine or on several.
+    The samples are split into passes with independent seeds, which are added in the order of their indices. The same
+    seed therefore gives the same bits (within the limits of `trace_pass`), interrupted or not, on one machine or on
+    several.
 
     Args:
         scene_path: an XML scene; its film may be of any kind (see `load_spectral_scene`).
         spp: samples per pixel, four wavelengths each; the scene's sampler may round it up.
-        width: in pixels; default: that of the film.
-        height: likewise.
+        width, height, parameters, materials, motion: as of `load_spectral_scene`.
         seed: random seed, not negative.
-        parameters: values for the scene's `$name` parameters.
-        materials: gratings that replace BSDFs, see `load_spectral_scene`.
-        motion: of the camera, see `load_spectral_scene`.
         until_error: stop when the relative error of the picture (`error_of_picture`) is at most this; spp is then the
             maximum.
         checkpoint: file in which the sums are saved periodically. If it exists, rendering resumes from it. The caller
@@ -481,9 +477,8 @@ def render(
             it is read from the sums block by block.
 
     Returns:
-        The picture; radiance per nm at `channel_wavelengths` of the film's range. Its attributes are the scene, the
-        variant, the samples per pixel, the seed, the error (from four passes on) and the digest of the request. A large
-        one is read from its checkpoints when it is saved (`BandedImage`).
+        The picture; its attributes are the scene, the variant, the samples per pixel, the seed, the error (from four
+        passes on) and the digest of the request. A large one is read from its checkpoints when it is saved.
 
     Raises:
         FileNotFoundError: if there is no such scene.
