@@ -51,15 +51,14 @@ class KappaBins:
 
 def mean_powers(spectrum: GratingSpectrum, kappa_bins: KappaBins) -> NDArray[np.float64]:
     """Return the powers averaged over each bin of κ and normalised to the sum one: (KAPPA_BINS, rows, columns)."""
-    return np.stack([_mean_power(spectrum, *ends) for ends in itertools.pairwise(kappa_bins.ends)])
-
-
-def _mean_power(spectrum: GratingSpectrum, first: float, end: float) -> NDArray[np.float64]:
-    # As a function of κ the powers have angular frequencies up to the height range.
-    points = int(np.ceil((end - first) * spectrum.height_range)) + 2
-    nodes = first + (np.arange(points) + 0.5) / points * (end - first)
-    total = functools.reduce(np.add, (spectrum.powers(kappa).astype(np.float64) for kappa in nodes))
-    return total / total.sum()
+    means = []
+    for first, end in itertools.pairwise(kappa_bins.ends):
+        # As a function of κ the powers have angular frequencies up to the height range.
+        points = int(np.ceil((end - first) * spectrum.height_range)) + 2
+        nodes = first + (np.arange(points) + 0.5) / points * (end - first)
+        total = functools.reduce(np.add, (spectrum.powers(kappa).astype(np.float64) for kappa in nodes))
+        means.append(total / total.sum())
+    return np.stack(means)
 
 
 def choose(weights: mi.Vector4f, u: mi.Float) -> tuple[mi.UInt32, mi.Float]:

@@ -180,12 +180,7 @@ class Layers:
         return dr.select(active, value, 0), dr.select(active, pdf, 0)
 
     def sample(
-        self,
-        ctx: mi.BSDFContext,
-        si: mi.SurfaceInteraction3f,
-        sample1: mi.Float,
-        sample2: mi.Point2f,
-        active: mi.Bool,
+        self, ctx: mi.BSDFContext, si: mi.SurfaceInteraction3f, sample1: mi.Float, sample2: mi.Point2f, active: mi.Bool
     ) -> tuple[mi.BSDFSample3f, mi.Spectrum]:
         """Draw a direction, as `mi.BSDF.sample`."""
         active = active & self.interface.is_incident(mi.Frame3f.cos_theta(si.wi))

@@ -182,7 +182,11 @@ def surface_from(props: mi.Properties, media: Media, scale: float = 1.0) -> Spec
             f"profile ({', '.join(PROFILES)}) or, from Python, spectrum"
         )
     if given != ["profile"]:
-        surface = _by_handle(props["spectrum"]) if given == ["spectrum"] else _from_file(props, media, scale)
+        surface = _handed_over.get(props["spectrum"]) if "spectrum" in given else _from_file(props, media, scale)
+        if surface is None:
+            raise RequestError(
+                f"spectrum: got {props['spectrum']!r}, wanted a spectrum in Python's load_dict; XML takes a filename"
+            )
         if isinstance(surface, Recipe):
             found = surface.settings.theory
         else:
@@ -246,14 +250,6 @@ def _from_file(props: mi.Properties, media: Media, scale: float) -> Spectrum | R
         f"filename: got {path}, wanted a saved spectrum (.exr) or a recipe (.toml); "
         "a scan is turned into a spectrum by `mitsuba-diffraction precompute`, or named by a recipe"
     )
-
-
-def _by_handle(handle: str) -> Spectrum:
-    """Return the spectrum of a handle that `hand_over` made."""
-    spectrum = _handed_over.get(handle)
-    if spectrum is None:
-        raise RequestError(f"spectrum: got {handle!r}, wanted a spectrum in Python's load_dict; XML takes a filename")
-    return spectrum
 
 
 def hand_over(value: object) -> object:

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from ..rigorous.efficiencies import ODD, REVERSED
 from ..rigorous.spectrum import RigorousSpectrum
-from .geometry import Geometry, Incidence, cell_of
+from .geometry import Geometry, Incidence, WaveVector, cell_of
 from .inversion import search, truncated_gaussian
 from .order_sampler import PROBABILITY_UNITS, cumulative_units
 from .tables import NumberTable, PacketTable, integer_part, larger, limited, opaque, smaller
@@ -111,10 +111,8 @@ class RigorousOrders:
     def evaluate(self, geometry: Geometry, incidence: Incidence, active: mi.Bool) -> tuple[mi.Float, mi.Float]:
         """As `Scattering.evaluate`, with the gain Γ of `Geometry.order_squares_and_gain`."""
         frequency = incidence.frequency
-        # Under a coat, the table is for directions and wavelengths inside of it.
-        k_i, k_o, index = geometry.incident, geometry.outgoing, incidence.coat_index
-        above = (k_i.sign > 0, k_o.sign > 0) if self.transmits else None
-        pair = self._pair(k_i.tangent / index, k_o.tangent / index, index * frequency, above)
+        # Under a coat, the table is for wavelengths inside of it.
+        pair = self._pair(geometry.incident, geometry.outgoing, frequency, incidence.coat_index * frequency)
         order_0 = self._bin(incidence)
         power, density = mi.Float(0.0), mi.Float(0.0)
         for m, square, in_lobe in self._near(pair, active):
@@ -124,54 +122,34 @@ class RigorousOrders:
             power += lobe * gain * self._efficiency(m, pair, in_lobe)
             # Evanescent orders are not drawn.
             in_lobe &= incidence.propagates(tangent)
-            index = mi.UInt32(dr.select(in_lobe, order_0 + m, 0))
-            density += dr.select(in_lobe, lobe, 0) * self.orders(index, in_lobe).y
+            entry = self.orders(mi.UInt32(dr.select(in_lobe, order_0 + m, 0)), in_lobe)
+            density += dr.select(in_lobe, lobe, 0) * entry.y
         return power * geometry.factor, density / PROBABILITY_UNITS
 
-    def _pair(
-        self,
-        k_i: mi.Vector2f | mi.Vector3f,
-        k_o: mi.Vector2f | mi.Vector3f,
-        frequency: mi.Float,
-        above: tuple[mi.Bool, mi.Bool] | None,
-    ) -> _Pair:
-        """Return the coordinates of a pair of directions.
-
-        Args:
-            k_i, k_o: n ω of both, or their parts along the surface.
-            frequency: 1/λ above.
-            above: whether each is above; None without transmission.
-        """
-        nu = self.period * frequency
-        k_y, c = 0.5 * nu * (k_o.y - k_i.y), 0.5 * nu * (k_o.x - k_i.x)
-        square = dr.square(nu) - dr.square(k_y)
-        inside, z = mi.Float(0.0), mi.Float(0.0)
+    def _pair(self, k_i: WaveVector, k_o: WaveVector, outside: mi.Float, frequency: mi.Float) -> _Pair:
+        """Return the coordinates of a pair of directions, from 1/λ outside and next to the relief above."""
+        nu, change = self.period * frequency, 0.5 * self.period * outside * (k_o.tangent - k_i.tangent)
+        square = dr.square(nu) - dr.square(change.y)
+        inside, z, above = mi.Float(0.0), mi.Float(0.0), None
         if self.transmits:
             inside = larger(dr.fma(self.excess, dr.square(nu), square), 0)
+            above = k_i.sign > 0, k_o.sign > 0
         else:
             z = self._z(dr.sqrt(larger(square, 0)), frequency)
         if not self.interface:
             square = larger(square, 0)
-        q_x, q_y = -(k_i.x + k_o.x) * frequency, -(k_i.y + k_o.y) * frequency
-        return _Pair(q_x, q_y, k_y, c, square, inside, z, above)
+        q = -(k_i.tangent + k_o.tangent) * outside
+        return _Pair(q.x, q.y, change.y, change.x, square, inside, z, above)
 
-    def mueller(
-        self,
-        source: mi.Vector2f | mi.Vector3f,
-        exit_: mi.Vector2f | mi.Vector3f,
-        frequency: mi.Float,
-        active: mi.Bool,
-        above: tuple[mi.Bool, mi.Bool] | None,
-    ) -> list[list[mi.Float]]:
-        """Return M_ij / M_00 of light from `source`, over all orders whose lobes contain the pair; else the identity.
+    def mueller(self, k_i: WaveVector, k_o: WaveVector, frequency: mi.Float, active: mi.Bool) -> list[list[mi.Float]]:
+        """Return M_ij / M_00 over all orders whose lobes contain a pair of directions; else the identity.
 
         Args:
-            source, exit_: along the pattern's axes, times n where light is transmitted.
-            frequency: 1/λ in cycles/µm, above.
+            k_i, k_o: of source and exit, along the pattern's axes; under a coat those of the directions inside.
+            frequency: 1/λ in cycles/µm, next to the relief above.
             active: mask.
-            above: whether each is above; None without transmission.
         """
-        pair = self._pair(source, exit_, frequency, above)
+        pair = self._pair(k_i, k_o, frequency, frequency)
         rows = [mi.Vector4f(0.0) for _ in range(4)]
         for m, square, in_lobe in self._near(pair, active & (dr.abs(pair.q_y) <= self.half_width)):
             lobe = dr.select(in_lobe, dr.exp(self.falloff * square), 0)

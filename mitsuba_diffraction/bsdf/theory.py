@@ -323,11 +323,8 @@ class RigorousTheory(Theory):
         def entries(channel: int, source: mi.Vector3f, exit_: mi.Vector3f) -> list[list[mi.Float]]:
             frequency = relative / si.wavelengths[channel]
             # Under a coat, directions and wavelength are those inside of it.
-            k_i, k_o = rotated(source, sin, cos), rotated(exit_, sin, cos)
-            if not self.interface.transmits:
-                return self.scattering.mueller(k_i, k_o, frequency, active, None)
-            k_i, k_o = self.interface.wave_vector(k_i), self.interface.wave_vector(k_o)
-            return self.scattering.mueller(k_i.tangent, k_o.tangent, frequency, active, (k_i.sign > 0, k_o.sign > 0))
+            k_i, k_o = (self.interface.wave_vector(rotated(omega, sin, cos)) for omega in (source, exit_))
+            return self.scattering.mueller(k_i, k_o, frequency, active)
 
         return of_orders(value, entries, mi.Vector3f(-sin, cos, 0))
 

@@ -128,16 +128,11 @@ class Layout:
             for k, j, i in np.ndindex(min(self.slices, 2), 2, 2)
         ]
 
-    def nodes(self) -> Real:
-        """Return the coordinates of all nodes, (n, 3), in the order of `shape`, for `directions`."""
-        return self._points(0.0)
+    def points(self, offset: float) -> Real:
+        """Return the coordinates of all nodes (`offset` 0) or of the centres of all grid cells (0.5), (n, 3).
 
-    def centres(self) -> Real:
-        """Return the coordinates of the centres of all grid cells, likewise, (n, 3)."""
-        return self._points(0.5)
-
-    def _points(self, offset: float) -> Real:
-        """Return coordinates of points in grid cells, of the next node with `offset` 0; (n, 3)."""
+        They are in the order of `shape`, for `directions`.
+        """
         last = 1 if offset == 0 else 0
         slices = np.arange(self.slices + last - 1) + offset if self.slices > 1 else np.zeros(1)
         axis = np.arange(self.first + last) + offset
@@ -203,11 +198,11 @@ class EnergyTable:
         above_and_below = (1,) if index is None else (1, -1)
         sides = [Furnace.of(spectrum, max(ratios), index, side, laterals[0]) for side in above_and_below]
         layout = Layout.of(sides[0], laterals)
-        e = _bounds(layout, sides, ratios, layout.nodes()).reshape(len(ratios), -1, *layout.shape)
+        e = _bounds(layout, sides, ratios, layout.points(0.0)).reshape(len(ratios), -1, *layout.shape)
         # e varies fast where an order is just above the horizon, and in deep reliefs: where it is less at the centre of
         # a grid cell than between the corners, they are lowered by the difference.
         corners = layout.corners()
-        of_centres = _bounds(layout, sides, ratios, layout.centres()).reshape(e[corners[0]].shape)
+        of_centres = _bounds(layout, sides, ratios, layout.points(0.5)).reshape(e[corners[0]].shape)
         excess = np.where(of_centres < 1, np.mean([e[corner] for corner in corners], axis=0) - of_centres, 0)
         lowered = e.copy()
         for corner in corners:

@@ -21,6 +21,14 @@ def ratio(a: mi.Float, b: mi.Float) -> mi.Float:
     return dr.select(b != 0, a / b, 0)
 
 
+def generator(seed: mi.UInt32 | int, key: int, index: mi.UInt32) -> mi.PCG32:
+    """Return random numbers of each index, independent of those that samplers draw from the same seed."""
+    mixed = mi.UInt32(seed) ^ key
+    dr.make_opaque(mixed)
+    state, sequence = mi.sample_tea_32(index, mixed)
+    return mi.PCG32(initstate=mi.UInt64(state), initseq=mi.UInt64(sequence))
+
+
 class Gratings:
     """The shapes whose BSDF is or holds a `diffraction_grating` and on which points can be drawn by area.
 
@@ -333,12 +341,7 @@ class LightPaths:
     def _trace(self, seed: mi.UInt32 | int, first: int, count: int, scale: float, buffer: SplatBuffer) -> None:
         """Trace the paths from the number `first` on, and add their contributions to the sensor to `buffer`."""
         path = dr.arange(mi.UInt32, count) + dr.opaque(mi.UInt32, first)
-        rng = mi.PCG32()
-        # Independent of the numbers that the sampler draws from the same seed.
-        key = mi.UInt32(seed) ^ 0x9E3779B9
-        dr.make_opaque(key)
-        state, sequence = mi.sample_tea_32(path, key)
-        rng.seed(mi.UInt64(state), mi.UInt64(sequence))
+        rng = generator(seed, 0x9E3779B9, path)
         ray, power, active = self._start(rng)
         power *= dr.opaque(mi.Float, scale)
         si = self.scene.ray_intersect(ray, active)

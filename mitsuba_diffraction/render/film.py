@@ -23,7 +23,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..errors import RequestError, root_cause
-from ..integrator.paths import LightPaths, unpacked
+from ..integrator.paths import LightPaths, generator, unpacked
 from .scene import channel_wavelengths, channel_weights, recorded_range, wavelengths_of
 
 Rows = tuple[int, int]
@@ -182,11 +182,7 @@ def _rotated_sampler(variant: str) -> type:
         def __init__(self, sampler: mi.Sampler, seed: int, pixel: mi.UInt32) -> None:
             mi.Sampler.__init__(self, mi.Properties())
             self.sampler = sampler
-            # Independent of the numbers that the sampler draws from the same seed.
-            key = mi.UInt32(seed) ^ 0x7F4A7C15
-            dr.make_opaque(key)
-            state, sequence = mi.sample_tea_32(pixel, key)
-            self.rng = mi.PCG32(initstate=mi.UInt64(state), initseq=mi.UInt64(sequence))
+            self.rng = generator(seed, 0x7F4A7C15, pixel)
 
         def next_1d(self, active: mi.Bool = True) -> mi.Float:
             return _fraction(self.sampler.next_1d(active) + self.rng.next_float32())

@@ -130,12 +130,7 @@ class SpectralImage:
         return bool(largest <= half.max and total / math.prod(self.shape) >= half.smallest_normal)
 
     def save(
-        self,
-        path: str | os.PathLike[str],
-        *,
-        half: bool | None = False,
-        rgb: bool = False,
-        channels: int | None = None,
+        self, path: str | os.PathLike[str], *, half: bool | None = False, rgb: bool = False, channels: int | None = None
     ) -> None:
         """Write an OpenEXR file in the spectral layout of Fichet, Pacanowski and Wilkie 2021.
 
