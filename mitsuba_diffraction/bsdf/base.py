@@ -49,15 +49,6 @@ def parts(plugin: mi.Object, kind: type) -> list[Any]:
     return found
 
 
-TRANSMITS = (
-    mi.BSDFFlags.DiffuseTransmission
-    | mi.BSDFFlags.GlossyTransmission
-    | mi.BSDFFlags.DeltaTransmission
-    | mi.BSDFFlags.Null
-)
-REFLECTS = mi.BSDFFlags.DiffuseReflection, mi.BSDFFlags.GlossyReflection, mi.BSDFFlags.DeltaReflection
-
-
 def base_from(props: mi.Properties) -> Base | None:
     """Return the nested BSDF of the parameter `base`, or None.
 
@@ -98,11 +89,11 @@ class Base:
 
     def __init__(self, bsdf: mi.BSDF) -> None:
         flags = bsdf.flags()
-        if flags & +TRANSMITS:
+        if flags & +mi.BSDFFlags.Transmission:
             raise RequestError(
                 "base: got a BSDF that lets light through (transmission or a mask), wanted one that only reflects"
             )
-        if not (flags & +mi.BSDFFlags.FrontSide and any(flags & +kind for kind in REFLECTS)):
+        if not (flags & +mi.BSDFFlags.FrontSide and flags & +mi.BSDFFlags.Reflection):
             raise RequestError("base: got a BSDF that reflects nothing at its front, wanted one that reflects")
         self.bsdf = bsdf
         self.components = [bsdf.flags(i) & ~+mi.BSDFFlags.BackSide for i in range(bsdf.component_count())]
@@ -111,10 +102,11 @@ class Base:
 
     def context(self, ctx: mi.BSDFContext) -> mi.BSDFContext | None:
         """Return the context for the nested BSDF, whose components follow the grating's; None if none is requested."""
+        kinds = mi.BSDFFlags.DiffuseReflection, mi.BSDFFlags.GlossyReflection, mi.BSDFFlags.DeltaReflection
         if not any(
             flags & +mi.BSDFFlags.FrontSide and flags & +kind and ctx.is_enabled(kind, component)
             for component, flags in enumerate(self.components, 1)
-            for kind in REFLECTS
+            for kind in kinds
         ):
             return None
         inner = mi.BSDFContext(ctx.mode)

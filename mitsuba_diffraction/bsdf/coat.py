@@ -80,11 +80,3 @@ class Coat:
     def reflectance(self, cos: mi.Float) -> mi.Float:
         """Return F at the cosine of an angle outside."""
         return mi.fresnel(cos, self.eta)[0]
-
-    def sampling_probability(self, cos: mi.Float, albedo: mi.Float) -> mi.Float:
-        """Return the probability of sampling the front face, from the albedo of the layers below it."""
-        front = self.reflectance(cos)
-        return dr.detach(dr.clip(front / (front + dr.square(1 - front) * albedo), 0, 1))
-
-    def __repr__(self) -> str:
-        return f"n = {self.index:g}"

@@ -54,9 +54,6 @@ class Energy:
             self.last_ratio, self.first_ratio = opaque(len(self.ratios) - 1), opaque(first)
             self.per_ratio = opaque((len(self.ratios) - 1) / (last - first))
 
-    def __str__(self) -> str:
-        return "bounds the albedo by about one"
-
     def coordinates(self, omega: mi.Vector3f) -> Coordinates:
         """Return the coordinates of ω, a unit vector along the pattern's axes next to the relief, z < 0 below."""
         z = dr.abs(omega.z) if self.two_sided else larger(omega.z, 0)

@@ -32,9 +32,7 @@ class Grating:
         recipe: from which the spectrum was built; None for a saved one.
         theory: the powers of orders, and R, E and other factors.
         coat: over the grating, or None.
-        scales: of heights and of lengths along the surface; one for rigorous theory.
-        orientation: degrees from the tangent to the pattern's x axis.
-        from_radius: whether they are from the radius, away from the centre of UV space, instead.
+        scales, orientation, from_radius: as of `GratingRequest`.
     """
 
     def __init__(self, props: mi.Properties, request: GratingRequest) -> None:
@@ -347,7 +345,7 @@ class Grating:
             f"{self.spectrum.extent} = {self.spectrum.grid}",
             f"coherence_length = {self.spectrum.coherence_length:g} um",
             f"representation = {self.spectrum.representation}, {self.spectrum.megabytes:.3g} MB",
-            *([] if self.coat is None else [f"coat = {self.coat}"]),
+            *([] if self.coat is None else [f"coat = n = {self.coat.index:g}"]),
             f"orientation = {self.orientation}{' from the radius' if self.from_radius else ''}",
             str(self.theory),
         ]

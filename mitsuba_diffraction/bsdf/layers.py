@@ -126,7 +126,8 @@ class Layers:
         reflected = self.grating.reflectance(si, cos, active)
         if request.base is not None and self.base is not None:
             reflected += (1 - reflected) * self.base.albedo(si, active)
-        return self.coat.sampling_probability(cos, dr.mean(reflected))
+        front = self.coat.reflectance(cos)
+        return dr.detach(dr.clip(front / (front + dr.square(1 - front) * dr.mean(reflected)), 0, 1))
 
     def albedo(self, si: mi.SurfaceInteraction3f, active: mi.Bool) -> mi.UnpolarizedSpectrum:
         """Return the reflectance of a plane of the material and of the diffuse base under it, as a guide of denoisers.

@@ -356,9 +356,9 @@ class GratingRequest:
 
     Attributes:
         media: around the grating.
-        scales: of heights and of lengths along the surface.
-        orientation: degrees from the tangent, or from the radius, to the pattern's x axis.
-        from_radius: whether they are from the radius.
+        scales: of heights and of lengths along the surface; one in rigorous theory.
+        orientation: degrees from the tangent to the pattern's x axis.
+        from_radius: whether they are from the radius, away from the centre of UV space, instead.
         material: R of scalar theory.
         shadowing: whether G is a factor in scalar theory.
         conserve_energy: whether E is.

@@ -44,7 +44,9 @@ class SharedTables:
         if isinstance(spectrum, RigorousSpectrum):
             self.table = RigorousOrders(spectrum)
         else:
-            max_kappa = None if eta is None else typical_max_kappa(eta)
+            # Of nearly all transmitted light: 1.5 times that of undiffracted light along the normal, at the shortest
+            # visible wavelength.
+            max_kappa = None if eta is None else 3 * np.pi * abs(eta - 1) / (VISIBLE[0] * 1e-3)
             kind = OrderSpectrum if isinstance(spectrum.grid, OrderGrid) else SplineSpectrum
             self.table = kind(spectrum, max_kappa)
         self.max_scale: float | None = None
@@ -105,11 +107,3 @@ class SharedTables:
                     table = EnergyTable.of(spectrum, key[0], self._eta, key[1])
                 self._energy = key, Energy(table) if table.needed else None
             return self._energy[1]
-
-
-def typical_max_kappa(eta: float) -> float:
-    """Return a bound of κ (rad/µm) for nearly all transmitted light.
-
-    It is 1.5 times κ = 2π |η − 1|/λ of undiffracted light along the normal, at the shortest visible λ.
-    """
-    return 3 * np.pi * abs(eta - 1) / (VISIBLE[0] * 1e-3)

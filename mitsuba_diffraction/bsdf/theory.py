@@ -263,11 +263,14 @@ class ScalarTheory(Theory):
         return of_facets(value, planes, self.interface.eta)
 
     def __str__(self) -> str:
+        energy = "conserved by itself" if self.conserve_energy else "not conserved"
+        if self.energy is not None:
+            energy = "bounds the albedo by about one"
         lines = {
             "reflectance": self.material,
             **{scale.name: scale for scale in self.scales},
             "shadowing": SHADOWING[0 if self.shadowing else 1],
-            "energy": self.energy or ("conserved by itself" if self.conserve_energy else "not conserved"),
+            "energy": energy,
         }
         return "\n".join(f"{name} = {value}" for name, value in lines.items())
 
