@@ -70,11 +70,14 @@ class Interface:
 
     Attributes:
         coat_index: n of the medium next to the relief above, relative to the outside; one without a coat.
-        eta: index below relative to that above; None where no light is transmitted.
+        eta: index below relative to that above; one where no light is transmitted.
         transmits: whether there is a medium below.
         is_sheet: whether the lower medium is a film with a flat lower face, with the upper medium below it.
         rigorous: whether tables are of rigorous theory: these do not depend on the sign of κ, include the flat face of
             a sheet, and are less like a plane.
+        kappa_has_sign: whether tables are read at −q where κ is negative.
+        mirrors_q: whether −q is drawn where κ is assumed negative, which is the case where orders overlap.
+        has_flat_face: whether there is a flat face that the tables do not include.
         kappas: the two bounds whose minimum is κ₁, in rad/µm for unscaled heights (`furnace.small_kappas`); None where
             κ₁ is zero, in reflection and for rigorous theory.
         transmitted_fraction: returns the transmitted fraction of power for a direction along the pattern's axes, where
@@ -93,6 +96,8 @@ class Interface:
     ) -> None:
         self.coat_index, self.transmits, self.is_sheet = mi.Float(coat_index), eta is not None, is_sheet
         self.rigorous, self.kappas, self.transmitted_fraction = rigorous, kappas, transmitted_fraction
+        self.kappa_has_sign, self.has_flat_face = self.transmits and not rigorous, is_sheet and not rigorous
+        self.mirrors_q = self.kappa_has_sign and transmitted_fraction is None
         # In reflection literals, so that Dr.Jit eliminates the terms of the medium below.
         self.eta = mi.Float(1.0) if eta is None else eta
 
@@ -102,21 +107,6 @@ class Interface:
             return mi.Float(0.0)
         first, undiffracted = self.kappas
         return smaller(first, undiffracted * dr.detach(height_scale))
-
-    @property
-    def kappa_has_sign(self) -> bool:
-        """Whether tables are read at −q where κ is negative."""
-        return self.transmits and not self.rigorous
-
-    @property
-    def mirrors_q(self) -> bool:
-        """Whether −q is drawn where κ is assumed negative, which is the case where orders overlap."""
-        return self.kappa_has_sign and self.transmitted_fraction is None
-
-    @property
-    def has_flat_face(self) -> bool:
-        """Whether there is a flat face that the tables do not include."""
-        return self.is_sheet and not self.rigorous
 
     def is_incident(self, cos: mi.Float) -> mi.Bool:
         """Return whether light that is incident from a direction with this cosine is scattered."""

@@ -33,19 +33,16 @@ class _Pair:
     """A pair of directions in the coordinates of `Axes`.
 
     Attributes:
-        q_x, q_y: cycles/µm.
-        k_y: as of `Axes`, in units of 2π/T.
-        c: as of `Axes`.
+        q: cycles/µm.
+        half: (c, k_y) of `Axes`, half of the difference of k_∥ in units of 2π/T.
         square: γ².
         inside: γ'²; zero if Z is the wavelength.
         z: Z, if it is the wavelength.
         above: whether the incident and the outgoing direction are above; None without transmission.
     """
 
-    q_x: mi.Float
-    q_y: mi.Float
-    k_y: mi.Float
-    c: mi.Float
+    q: mi.Vector2f
+    half: mi.Vector2f
     square: mi.Float
     inside: mi.Float
     z: mi.Float
@@ -101,12 +98,12 @@ class RigorousOrders:
 
     def _near(self, pair: _Pair, active: mi.Bool) -> Iterator[tuple[mi.Int32, mi.Float, mi.Bool]]:
         """Yield m, |q − m/T|², and whether the lobe contains q_x, of the orders whose lobes may contain q."""
-        first = self._first(pair.q_x)
+        first = self._first(pair.q.x)
         for step in range(self.count):
             m = first + step
-            offset = dr.fma(-self.pitch, mi.Float(m), pair.q_x)
+            offset = dr.fma(-self.pitch, mi.Float(m), pair.q.x)
             in_lobe = active & (dr.abs(offset) <= self.half_width) & (dr.abs(m) <= self.max_order)
-            yield m, dr.square(offset) + dr.square(pair.q_y), in_lobe
+            yield m, dr.square(offset) + dr.square(pair.q.y), in_lobe
 
     def evaluate(self, geometry: Geometry, incidence: Incidence, active: mi.Bool) -> tuple[mi.Float, mi.Float]:
         """As `Scattering.evaluate`, with the gain Γ of `Geometry.order_squares_and_gain`."""
@@ -128,8 +125,8 @@ class RigorousOrders:
 
     def _pair(self, k_i: WaveVector, k_o: WaveVector, outside: mi.Float, frequency: mi.Float) -> _Pair:
         """Return the coordinates of a pair of directions, from 1/λ outside and next to the relief above."""
-        nu, change = self.period * frequency, 0.5 * self.period * outside * (k_o.tangent - k_i.tangent)
-        square = dr.square(nu) - dr.square(change.y)
+        nu, half = self.period * frequency, 0.5 * self.period * outside * (k_o.tangent - k_i.tangent)
+        square = dr.square(nu) - dr.square(half.y)
         inside, z, above = mi.Float(0.0), mi.Float(0.0), None
         if self.transmits:
             inside = larger(dr.fma(self.excess, dr.square(nu), square), 0)
@@ -138,8 +135,7 @@ class RigorousOrders:
             z = self._z(dr.sqrt(larger(square, 0)), frequency)
         if not self.interface:
             square = larger(square, 0)
-        q = -(k_i.tangent + k_o.tangent) * outside
-        return _Pair(q.x, q.y, change.y, change.x, square, inside, z, above)
+        return _Pair(-(k_i.tangent + k_o.tangent) * outside, half, square, inside, z, above)
 
     def mueller(self, k_i: WaveVector, k_o: WaveVector, frequency: mi.Float, active: mi.Bool) -> list[list[mi.Float]]:
         """Return M_ij / M_00 over all orders whose lobes contain a pair of directions; else the identity.
@@ -151,12 +147,12 @@ class RigorousOrders:
         """
         pair = self._pair(k_i, k_o, frequency, frequency)
         rows = [mi.Vector4f(0.0) for _ in range(4)]
-        for m, square, in_lobe in self._near(pair, active & (dr.abs(pair.q_y) <= self.half_width)):
+        for m, square, in_lobe in self._near(pair, active & (dr.abs(pair.q.y) <= self.half_width)):
             lobe = dr.select(in_lobe, dr.exp(self.falloff * square), 0)
             for row, found in enumerate(self._matrix(m, pair, in_lobe)):
                 rows[row] += lobe * found
         bright = rows[0].x > 0
-        across = pair.k_y / (self.period * frequency)
+        across = pair.half.y / (self.period * frequency)
         scale = dr.rcp(dr.select(bright, rows[0].x, mi.Float(1)))
         matrix = [[rows[i][j] * scale * (across if ODD[i, j] else 1) for j in range(4)] for i in range(4)]
         # Interpolated matrices may have a degree of polarisation above one: then all elements but M_00 are reduced.
@@ -219,7 +215,7 @@ class RigorousOrders:
         They are the row; of F, X and Z the grid cell and the coordinate in it; whether the table holds the reverse of
         the pair; and whether the order propagates.
         """
-        k_x = pair.c + 0.5 * mi.Float(m)
+        k_x = pair.half.x + 0.5 * mi.Float(m)
         whole = dr.round(k_x)
         n, a = mi.Int32(whole), dr.abs(k_x - whole)
         is_reversed = k_x < whole

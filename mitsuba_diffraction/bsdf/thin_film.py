@@ -62,12 +62,11 @@ def waves(
     square = dr.square(z_0) - dr.square(n_0)
     z_1, z_2 = (_root(n * n + square, is_real) for n, is_real in zip((n_1, n_2), real, strict=True))
     beta = dr.two_pi * thickness * z_1
+    sin, cos = dr.sincos(beta.real)
     if real[0]:
         # Both u and v without their factor e^{iβ}.
-        sin, cos = dr.sincos(beta.real)
         u, v, across = mi.Complex2f(cos, 0), mi.Complex2f(0, -sin), mi.Complex2f(1, 0)
     else:
-        sin, cos = dr.sincos(beta.real)
         across = dr.exp(-beta.imag) * mi.Complex2f(cos, sin)
         twice = across * across
         u, v = 0.5 * (1 + twice), 0.5 * (1 - twice)
