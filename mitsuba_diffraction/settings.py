@@ -93,9 +93,8 @@ class Settings:
             if (value := getattr(self, name)) not in known:
                 raise RequestError(f"{name}: got {value!r}, wanted one of {', '.join(known)}")
         min_tolerance = MIN_TOLERANCE if self.theory == "scalar" else MIN_RIGOROUS_TOLERANCE
-        min_length, max_length = MIN_COHERENCE_LENGTH, MAX_COHERENCE_LENGTH
         for name, valid, wanted in (
-            ("coherence_length", lambda x: min_length <= x <= max_length, f"µm, {min_length:g} to {max_length:g}"),
+            ("coherence_length", lambda x: lobe_width(x) > 0, "a number"),
             ("largest_angle", lambda x: 0 < x <= 90, "degrees from the normal, above 0, at most 90"),
             ("tolerance", lambda x: min_tolerance <= x < 1, f"a fraction of the light, from {min_tolerance:g} to 1"),
             ("largest_height_range", lambda x: x > 0, "a positive number of µm"),
@@ -188,7 +187,13 @@ def lobe_width(coherence_length: float) -> float:
 
     The window is Gaussian in amplitude, a(x) = exp(−|x|²/2σ_s²) with σ_s = L_c/4; the power of its transform is a
     Gaussian of standard deviation σ_q = 1/(2√2 π σ_s).
+
+    Raises:
+        ValueError: if the coherence length is not 1 nm to 1 m.
     """
+    if not MIN_COHERENCE_LENGTH <= coherence_length <= MAX_COHERENCE_LENGTH:
+        wanted = f"µm, {MIN_COHERENCE_LENGTH:g} to {MAX_COHERENCE_LENGTH:g}"
+        raise RequestError(f"coherence_length: got {coherence_length!r}, wanted {wanted}")
     return 1 / (2 * math.sqrt(2) * math.pi * (coherence_length / 4))
 
 

@@ -36,6 +36,7 @@ vary, the table has nodes in r.
 from __future__ import annotations
 
 import base64
+import binascii
 import dataclasses
 import zlib
 from collections.abc import Mapping, Sequence
@@ -45,6 +46,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from ..errors import RequestError
 from ..spectrum.grids import OrderGrid
 from ..spectrum.power_spectrum import PowerSpectrum
 from .furnace import Furnace, Real
@@ -80,6 +82,14 @@ class Layout:
     slices: int
     frequencies: tuple[float, float]
     turned: bool = False
+
+    def __post_init__(self) -> None:
+        if not (0 <= self.period < np.inf and 0 < self.frequencies[0] < self.frequencies[1] < np.inf):
+            raise RequestError(f"energy table: got period {self.period}, frequencies {self.frequencies}")
+        if min(self.squares, self.first, self.cells, self.slices - (not self.lines)) < 1:
+            raise RequestError(
+                f"energy table: got {self.squares}, {self.first}, {self.cells}, {self.slices}, wanted at least one each"
+            )
 
     @property
     def lines(self) -> bool:
@@ -179,6 +189,12 @@ class EnergyTable:
     values: NDArray[np.uint8] = field(repr=False)
     ratios: tuple[float, ...] = (1.0,)
 
+    def __post_init__(self) -> None:
+        got, wanted = self.values, (len(self.ratios), self.values.shape[1], *self.layout.shape)
+        if got.shape != wanted or got.dtype != np.uint8:
+            raise RequestError(f"energy table: got {got.dtype} {got.shape}, wanted uint8 {wanted}")
+        got.setflags(write=False)
+
     @classmethod
     def of(
         cls,
@@ -231,9 +247,22 @@ class EnergyTable:
 
     @classmethod
     def from_plain(cls, plain: Mapping[str, Any]) -> EnergyTable:
-        """Return the table that `as_plain` describes; its file is sealed."""
+        """Return the table that `as_plain` describes.
+
+        Raises:
+            ValueError, TypeError or KeyError: if it is not a table.
+        """
+        if plain.keys() != {"layout", "values"}:
+            raise RequestError(f"energy table: got {', '.join(plain)}, wanted layout, values")
         layout = Layout(**{**plain["layout"], "frequencies": tuple(plain["layout"]["frequencies"])})
-        content = zlib.decompress(base64.b64decode(plain["values"]))
+        size = int(np.prod(layout.shape, dtype=np.int64))
+        try:
+            # A limit, as a damaged file may expand without end.
+            content = zlib.decompressobj().decompress(base64.b64decode(plain["values"]), size + 1)
+        except (zlib.error, binascii.Error) as error:
+            raise RequestError(f"energy table: {error}") from None
+        if not 0 < size < 1 << 26 or len(content) != size:
+            raise RequestError(f"energy table: got {len(content)} bytes, wanted {size}")
         return cls(layout, np.frombuffer(content, np.uint8).reshape(1, 1, *layout.shape))
 
 

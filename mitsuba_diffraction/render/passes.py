@@ -29,7 +29,7 @@ from functools import cached_property
 from importlib import metadata
 from pathlib import Path
 from typing import Any
-from zipfile import ZipFile
+from zipfile import BadZipFile, ZipFile
 
 import mitsuba as mi
 import numpy as np
@@ -192,14 +192,17 @@ def load_checkpoint(path: str | os.PathLike[str], digest: str) -> Accumulation |
     """
     if not os.path.exists(path):
         return None
-    if not is_intact(path):
-        raise RequestError(
-            f"{os.fspath(path)}: not a checkpoint, or a damaged one (its contents do not match its digest)"
-        )
-    with np.load(path) as content:
-        if content["digest"].item() == digest:
-            stored = {field.name: content[field.name] for field in fields(Accumulation)}
-            return Accumulation(**{name: x if x.ndim else x.item() for name, x in stored.items()})
+    with open(path, "rb") as stream:
+        try:
+            if not is_intact(path):
+                raise RequestError("its contents do not match its digest")
+            with np.load(stream) as content:
+                if content["digest"].item() == digest:
+                    stored = {field.name: content[field.name] for field in fields(Accumulation)}
+                    return Accumulation(**{name: x if x.ndim else x.item() for name, x in stored.items()})
+        # Raised by NumPy and zipfile for damaged files.
+        except (ValueError, KeyError, TypeError, EOFError, AttributeError, RuntimeError, OSError, BadZipFile) as error:
+            raise RequestError(f"{os.fspath(path)}: not a checkpoint, or a damaged one ({error})") from None
     raise RequestError(
         f"{os.fspath(path)}: of another rendering: the scene or a file that it references, an option or a version has "
         "changed; repeat the original command, or remove the file to start over"

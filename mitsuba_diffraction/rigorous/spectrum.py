@@ -300,6 +300,7 @@ class RigorousSpectrum:
             table = getattr(self, name)
             if table is not None and (table.shape != wanted or table.dtype != np.float32):
                 raise RequestError(f"{name}: got {table.shape} of {table.dtype}, wanted {wanted} of float32")
+        lobe_width(self.coherence_length)
 
     @property
     def transmission(self) -> str:

@@ -20,6 +20,10 @@ class _Rectangle:
 
     max_order: tuple[int, int]
 
+    def __post_init__(self) -> None:
+        if not all(m >= 0 for m in self.max_order):
+            raise RequestError(f"max_order: got {self.max_order}, wanted two integers ≥ 0")
+
     @property
     def shape(self) -> tuple[int, int]:
         """(rows, columns) = (2 M_y + 1, 2 M_x + 1); row ↔ m_y, column ↔ m_x, both from −M."""
@@ -61,6 +65,7 @@ class OrderGrid(_Rectangle):
     def __post_init__(self) -> None:
         if not all(np.isfinite(t) and t > 0 for t in self.tile_size):
             raise RequestError(f"tile_size: got {self.tile_size}, wanted two positive lengths in µm")
+        super().__post_init__()
 
     @classmethod
     def reachable(cls, tile_size: tuple[float, float], pixels: tuple[int, int], max_frequency: float) -> OrderGrid:
@@ -151,6 +156,9 @@ class SplineGrid(_Rectangle):
     def __post_init__(self) -> None:
         if not all(np.isfinite(d) and d > 0 for d in self.spacing):
             raise RequestError(f"spacing: got {self.spacing}, wanted two positive numbers in cycles/µm")
+        super().__post_init__()
+        if not all(limit > 0 for limit in self.limit):
+            raise RequestError(f"limit: got {self.limit}, wanted two positive numbers in cycles/µm")
 
     def __str__(self) -> str:
         x, y = self.spacing

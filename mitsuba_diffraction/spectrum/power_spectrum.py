@@ -59,11 +59,20 @@ class PowerSpectrum:
             raise RequestError(f"table: got {self.table.shape} nodes, wanted {self.grid.shape}")
         if not all(np.isfinite(p) and p > 0 for p in self.pixel_size):
             raise RequestError(f"pixel_size: got {self.pixel_size}, wanted two positive lengths in µm")
-        for name in ("height_range", "error", "truncated_power", "unresolved_power", "standard_error"):
-            if not 0 <= (getattr(self, name) or 0.0) < np.inf:
-                raise RequestError(f"{name}: got {getattr(self, name)}, wanted a number ≥ 0")
+        if not (np.isfinite(self.height_range) and self.height_range >= 0):
+            raise RequestError(f"height_range: got {self.height_range}, wanted a length ≥ 0 in µm")
+        if not 0 <= self.error < np.inf:
+            raise RequestError(f"error: got {self.error}, wanted a fraction of the power")
         if not (isinstance(self.source, str) and isinstance(self.source_digest, str)):
             raise RequestError(f"source: got {self.source!r}, {self.source_digest!r}, wanted texts")
+        if not (0 <= self.truncated_power <= 1 and 0 <= self.unresolved_power <= 1):
+            got = f"{self.truncated_power}, {self.unresolved_power}"
+            raise RequestError(f"truncated_power, unresolved_power: got {got}, wanted fractions of the power")
+        if not (isinstance(self.patches, int) and self.patches >= 1):
+            raise RequestError(f"patches: got {self.patches!r}, wanted a whole number of at least 1")
+        found = self.standard_error
+        if (found is not None) != (self.extent == "sample") or not 0 <= (found or 0.0) < np.inf:
+            raise RequestError(f"standard_error: got {found} of a {self.extent}, wanted a number ≥ 0 of a sample only")
 
     @property
     def extent(self) -> str:

@@ -49,6 +49,7 @@ def effective_coherence_length(height_field: HeightField, requested: float) -> f
     Raises:
         ValueError: if it is below four pixels, too short for a window.
     """
+    lobe_width(requested)
     axes = list(zip(height_field.tile_size, height_field.pixel_size, height_field.shape[::-1], strict=True))
     effective = min([float(requested), *(_MAX_COHERENCE_FRACTION * size for size, _, count in axes if count > 1)])
     for _, pixel, count in axes:

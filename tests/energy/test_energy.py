@@ -2,6 +2,7 @@
 
 import functools
 import gc
+import json
 import weakref
 
 import drjit as dr
@@ -272,6 +273,19 @@ def test_the_table_is_stored_with_the_spectrum(tmp_path, monkeypatch):
     assert wanted.values.nbytes < 4e5
     bsdf = mi.load_dict({"type": "diffraction_grating", "filename": str(tmp_path / "s.exr")})
     assert bsdf.layers.grating.theory.energy is not None
+
+
+@pytest.mark.parametrize(
+    "wrong",
+    [{"values": "AAAA"}, {"unknown": 1}, {"slices": 1 << 20}, {"frequencies": [1, 0]}, {"period": 0}],
+)
+def test_a_damaged_table_is_refused(wrong):
+    plain = json.loads(json.dumps(spectrum("blazed").energy_table().as_plain()))
+    EnergyTable.from_plain(plain)
+    damaged = plain["layout"] if wrong.keys() <= plain["layout"].keys() else plain
+    damaged.update(wrong)
+    with pytest.raises((ValueError, TypeError)):
+        EnergyTable.from_plain(plain)
 
 
 @pytest.mark.slow

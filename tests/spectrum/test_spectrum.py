@@ -62,10 +62,12 @@ def test_the_nyquist_order_is_divided_equally_between_both_signs():
     assert grid.take(np.ones((3, 4))).sum() == 12
 
 
-@pytest.mark.parametrize("tile_size", [(0.0, 1.0), (1.0, np.nan), (1.0, np.inf)])
-def test_wrong_grids_are_refused(tile_size):
-    with pytest.raises(ValueError, match="tile_size: got"):
-        OrderGrid(tile_size, (1, 1))
+@pytest.mark.parametrize(
+    "arguments", [((0.0, 1.0), (1, 1)), ((1.0, np.nan), (1, 1)), ((1.0, np.inf), (1, 1)), ((1.0, 1.0), (1, -1))]
+)
+def test_wrong_grids_are_refused(arguments):
+    with pytest.raises(ValueError, match=r"tile_size|max_order"):
+        OrderGrid(*arguments)
 
 
 @given(change=st.floats(1e-7, 0.5))
@@ -145,10 +147,19 @@ def test_the_integral_of_a_spline_is_that_by_quadrature(x):
     assert spline_integral(np.array(x)) + spline_integral(np.array(-x)) == pytest.approx(1, abs=1e-12)
 
 
-@pytest.mark.parametrize("spacing", [(0.0, 1.0), (1.0, np.nan)])
-def test_wrong_lattices_are_refused(spacing):
-    with pytest.raises(ValueError, match="spacing: got"):
-        SplineGrid(spacing, (1, 1), (1.0, 1.0))
+@pytest.mark.parametrize(
+    "arguments",
+    [
+        ((0.0, 1.0), (1, 1), (1.0, 1.0)),
+        ((1.0, np.nan), (1, 1), (1.0, 1.0)),
+        ((1.0, 1.0), (1, -1), (1.0, 1.0)),
+        ((1.0, 1.0), (1, 1), (1.0, 0.0)),
+        ((1.0, 1.0), (1, 1), (np.nan, 1.0)),
+    ],
+)
+def test_wrong_lattices_are_refused(arguments):
+    with pytest.raises(ValueError, match=r"spacing|max_order|limit"):
+        SplineGrid(*arguments)
 
 
 # ---------------------------------------------------------------- tables
