@@ -8,7 +8,7 @@ from typing import Annotated
 import numpy as np
 import typer
 from numpy.typing import NDArray
-from PIL import Image
+from PIL import Image, ImageOps
 
 from ..errors import RequestError
 from ..files import refuse_special
@@ -92,10 +92,14 @@ def read_target(path: Path) -> NDArray[np.float64]:
     """
     refuse_special(path)
     try:
-        with Image.open(path) as image:
+        with Image.open(path) as opened:
+            image = ImageOps.exif_transpose(opened)
             has_alpha = image.mode.endswith("A") and image.getextrema()[-1] != (255, 255)
             if has_alpha or "transparency" in image.info:
                 raise RequestError(f"{path}: got a picture with alpha, wanted an opaque one")
+            # Older versions of Pillow open PNG files of 16 bits as 32 bit integers.
+            if image.mode == "F" or (image.mode == "I" and opened.format != "PNG"):
+                raise RequestError(f"{path}: got numbers of 32 bits, wanted a picture of 8 or 16 bits per channel")
             if image.mode.startswith("I"):
                 encoded = np.asarray(image, np.float64) / 65535
             else:

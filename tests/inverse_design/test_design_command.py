@@ -57,6 +57,24 @@ def test_a_target_is_a_picture_as_seen_on_a_screen():
     assert np.array_equal(read_target(Path("opaque.png")), found)
 
 
+def test_a_target_is_upright_as_its_exif_data_say():
+    exif = Image.Exif()
+    exif[0x0112] = 6  # its first row is shown on the right
+    with Image.open("flag.png") as picture:
+        picture.save("phone.png", exif=exif)
+    upright = read_target(Path("flag.png"))
+    assert np.array_equal(read_target(Path("phone.png")), np.rot90(upright, -1))
+    assert not np.array_equal(np.rot90(upright, -1), upright)
+
+
+@pytest.mark.parametrize("kind", [np.float32, np.int32])
+def test_a_target_of_32_bits_is_refused(kind):
+    levels = np.linspace(0, 1, 8).reshape(1, 8).repeat(8, 0)
+    Image.fromarray((levels * (1 if kind == np.float32 else 255)).astype(kind)).save("grey.tif")
+    with pytest.raises(ValueError, match=r"grey\.tif: got numbers of 32 bits, wanted a picture of 8 or 16 bits"):
+        read_target(Path("grey.tif"))
+
+
 def test_an_interrupted_command_writes_the_best_so_far(command, monkeypatch):
     class Bar:
         def __enter__(self):
