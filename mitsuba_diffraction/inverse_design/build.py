@@ -16,7 +16,7 @@ from ..errors import RequestError
 from ..progress import Progress, silent
 from ..rigorous.efficiencies import one_thread
 from ..settings import MIN_WAVELENGTH
-from .far_field import Array, FarField, bounds, lobes_in_bins, nearest_levels
+from .far_field import Array, FarField, lobes_in_bins, nearest_levels
 from .plate import Plate
 from .result import Design
 
@@ -198,11 +198,12 @@ class _Search:
         for _ in range(self._starts):
             heights = self._minimised(wide, self._random_relief(random), _FIRST_ITERATIONS)
             self._minimised(own, heights, _FIRST_ITERATIONS)
-        heights, fixed = self.heights, None
+        heights = self.heights
         self._found = [(math.inf, heights)]  # losses of another number of pixels cannot be compared
         if self._plate.levels is None:
             self._minimised(fine, heights, _LAST_ITERATIONS)
             return
+        fixed = np.zeros(heights.shape, bool)
         for fraction in _FIXED_FRACTIONS:
             heights = self._minimised(fine, heights, _LAST_ITERATIONS // len(_FIXED_FRACTIONS), fixed)
             nearest = nearest_levels(heights, self._plate.height_range, self._plate.levels)
@@ -222,9 +223,9 @@ class _Search:
         return plate.height_range * (smooth - smooth.min()) / max(np.ptp(smooth), 1e-30)
 
     def _minimised(
-        self, far_field: FarField, heights: Array, iterations: int, fixed: NDArray[np.bool_] | None = None
+        self, far_field: FarField, heights: Array, iterations: int, fixed: NDArray[np.bool_] | bool = False
     ) -> Array:
-        """Return the heights of the smallest loss that L-BFGS-B finds from the given ones."""
+        """Return the heights of the smallest loss that L-BFGS-B finds from the given ones, some of them `fixed`."""
         self._found.append((math.inf, heights))
 
         def loss(flat: Array) -> tuple[float, Array]:
@@ -244,7 +245,9 @@ class _Search:
             heights.ravel(),
             jac=True,
             method="L-BFGS-B",
-            bounds=bounds(heights, self._plate.height_range, fixed),
+            bounds=scipy.optimize.Bounds(
+                np.where(fixed, heights, 0).ravel(), np.where(fixed, heights, self._plate.height_range).ravel()
+            ),
             callback=report,
             options={"maxiter": iterations, "maxcor": _CORRECTIONS, "ftol": _TOLERANCE, "gtol": 0.0},
         )

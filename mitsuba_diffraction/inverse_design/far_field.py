@@ -1,14 +1,13 @@
 """The far field of a relief of square texels, its distance from the wanted one, and the gradient of that.
 
-    z = U h Uᵀ                                   heights of the pixels, from those of the texels, h (`blurred_texels`)
-    η_m = |F_m|²,  F = fft2(e^{iκz})/N           power of each order, for light along the normal
-    P = A_y η A_xᵀ                               power in each bin of direction cosines (`lobes_in_bins`)
-    L_λ = Σ (P − t)²/Σ t²                        t the wanted fraction of the light, Σ over bins (`relative_difference`)
-    L = (mean L_λ³)^⅓                            over the wavelengths: the larger ones count more (`cubic_mean`)
+z = U h Uᵀ                                   heights of the pixels, from those of the texels, h (`blurred_texels`)
+η_m = |F_m|²,  F = fft2(e^{iκz})/N           power of each order, for light along the normal
+P = A_y η A_xᵀ                               power in each bin of direction cosines (`lobes_in_bins`)
+L_λ = Σ (P − t)²/Σ t²                        t the wanted fraction of the light, Σ over bins
+L = (mean L_λ³)^⅓                            over the wavelengths: the larger ones count more
 
-    ∂L/∂P = ∂L/∂L_λ ∂L_λ/∂P,   ∂L/∂z (`phase_gradient`) with g = A_yᵀ ∂L/∂P A_x,   ∂L/∂h = Uᵀ ∂L/∂z U
-
-The constraints are `bounds` of the heights and `nearest_levels`.
+∂L/∂P = (L_λ/L)²/w · 2 (P − t)/Σ t²,   ∂L/∂η = g = A_yᵀ ∂L/∂P A_x,   w the number of wavelengths
+∂L/∂z = 2 Re[conj(iκ e^{iκz}) · ifft2(g F)],   ∂L/∂h = Uᵀ ∂L/∂z U
 """
 
 from __future__ import annotations
@@ -18,7 +17,6 @@ from dataclasses import dataclass
 import numpy as np
 import scipy.fft
 from numpy.typing import ArrayLike, NDArray
-from scipy.optimize import Bounds
 from scipy.special import ndtr
 
 from ..settings import lobe_width
@@ -86,43 +84,19 @@ class FarField:
         phase = kappa * self.relief(heights).astype(dtype)
         wave = np.cos(phase) + 1j * np.sin(phase)
         amplitudes = scipy.fft.fft2(wave, norm="forward")
-        predicted = self.lobes @ (amplitudes.real**2 + amplitudes.imag**2) @ transposed
-        differences, of_predicted = relative_difference(predicted, self.wanted)
-        value, of_differences = cubic_mean(differences)
-        g = transposed @ (of_differences[:, None, None] * of_predicted).astype(dtype) @ self.lobes
-        gradient = phase_gradient(wave, amplitudes, kappa, g).sum(axis=0)
+        difference = self.lobes @ (amplitudes.real**2 + amplitudes.imag**2) @ transposed - self.wanted
+        scale = (self.wanted**2).sum(axis=(1, 2))
+        of_wavelengths = (difference**2).sum(axis=(1, 2)) / scale
+        value = float(np.cbrt((of_wavelengths**3).mean()))
+        weight = (of_wavelengths / value) ** 2 / len(of_wavelengths)
+        of_predicted = weight[:, None, None] * (2 * difference / scale[:, None, None])
+        g = transposed @ of_predicted.astype(dtype) @ self.lobes
+        back = scipy.fft.ifft2(g * amplitudes)
+        gradient = (2 * kappa * (wave.real * back.imag - wave.imag * back.real)).sum(axis=0)
         return value, self.texels.T @ gradient @ self.texels
-
-
-def relative_difference(predicted: Array, wanted: Array) -> tuple[Array, Array]:
-    """Return L_λ, (w,), and ∂L_λ/∂P = 2 (P − t)/Σ t², (w, bins, bins)."""
-    difference, scale = predicted - wanted, (wanted**2).sum(axis=(1, 2))
-    return (difference**2).sum(axis=(1, 2)) / scale, 2 * difference / scale[:, None, None]
-
-
-def cubic_mean(values: Array) -> tuple[float, Array]:
-    """Return L = (mean v³)^⅓ of values v > 0, (w,), and its gradient, (v/L)²/w."""
-    mean = float(np.cbrt((values**3).mean()))
-    return mean, (values / mean) ** 2 / len(values)
-
-
-def phase_gradient(
-    wave: NDArray[np.complexfloating], amplitudes: NDArray[np.complexfloating], kappa: Array, g: Array
-) -> Array:
-    """Return ∂L/∂z = 2 Re[conj(iκ e^{iκz}) · ifft2(g F)] from e^{iκz}, F and g = ∂L/∂η, all of one shape."""
-    back = scipy.fft.ifft2(g * amplitudes)
-    return 2 * kappa * (wave.real * back.imag - wave.imag * back.real)
 
 
 def nearest_levels(heights: Array, height_range: float, levels: int) -> Array:
     """Return the nearest of the levels k · height_range/(levels − 1), k = 0 … levels − 1."""
     step = height_range / (levels - 1)
     return np.clip(np.rint(heights / step), 0, levels - 1) * step
-
-
-def bounds(heights: Array, height_range: float, fixed: NDArray[np.bool_] | None = None) -> Bounds:
-    """Return 0 ≤ h ≤ height_range, and h as it is where `fixed`."""
-    low, high = np.zeros(heights.shape), np.full(heights.shape, height_range)
-    if fixed is not None:
-        low[fixed] = high[fixed] = heights[fixed]
-    return Bounds(low.ravel(), high.ravel())
