@@ -109,9 +109,9 @@ def _sample_spectrum(height_field: HeightField, q: Real, kappa: Real, coherence_
     """Compute Welch's estimate of S for q (M, 2) and κ (M,): (M,) µm²."""
     effective = effective_coherence_length(height_field, coherence_length)
     windows = window_axes(height_field, effective)
-    result = _mean_periodograms(height_field, q, kappa, *(w or UNIFORM for w in windows))
+    result = _mean_periodograms(height_field, q, kappa, *windows)
     for q_j, window, pixel in zip(q.T, windows, height_field.pixel_size, strict=True):
-        if window is None:
+        if window is UNIFORM:
             result *= _gaussian(q_j, lobe_width(effective))
         else:
             # Zero outside the Nyquist limit; rounding of q must not exclude the limit itself.

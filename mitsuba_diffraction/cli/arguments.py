@@ -183,7 +183,7 @@ def takes_scan(command: Callable[..., None]) -> Callable[..., None]:
 
 def options_of_scan(context: typer.Context) -> dict[str, object]:
     """Return the given options of a scan, under their names in recipes."""
-    given = _given(context, [name for name in SCAN_OPTIONS if name not in ("extent", "coherence_length")])
+    given = given_of(context, [name for name in SCAN_OPTIONS if name not in ("extent", "coherence_length")])
     if len(unit := given.get("unit", ())) == 1:
         given["unit"] = unit[0]
     steps = [*["level_plane"] * context.params.get("plane", False), *given.get("prepare", [])]
@@ -192,19 +192,22 @@ def options_of_scan(context: typer.Context) -> dict[str, object]:
 
 def settings_of(context: typer.Context) -> dict[str, Any]:
     """Return the given options of the spectrum, under their names in `Settings`."""
-    return _given(context, [field.name for field in fields(Settings)])
+    return given_of(context, [field.name for field in fields(Settings)])
 
 
-def _given(context: typer.Context, names: Iterable[str]) -> dict[str, Any]:
+def given_of(context: typer.Context, names: Iterable[str]) -> dict[str, Any]:
+    """Return the options of these names that were given, by name."""
     # Zero counts as given: it is checked where it is used.
     return {n: value for n in names if (value := context.params.get(n)) not in (None, ()) and value is not False}
 
 
-def recipe_of(source: Path, of_scan: dict[str, Any], settings: dict[str, Any]) -> Recipe:
-    """Return the recipe in a file, or the one equivalent to a scan; `settings` override those of a file."""
+def recipe_of(source: Path, of_scan: dict[str, Any], settings: dict[str, Any], extent: str = "sample") -> Recipe:
+    """Return the recipe in a file, or that of a scan; `settings` override those of a file and the extent of a scan.
 
+    Scans are samples by default, as they are rarely cut to whole periods.
+    """
     if source.suffix.lower() != ".toml":
-        return Recipe({"scan": source.name, **of_scan}, Settings(**settings), source.parent)
+        return Recipe({"scan": source.name, **of_scan}, Settings(**{"extent": extent, **settings}), source.parent)
     if of_scan:
         names = ", ".join(f"--{name.replace('_', '-')}" for name in of_scan)
         raise RequestError(f"{names} go with a scan; the recipe {source} has its own")

@@ -125,7 +125,7 @@ def _recipe(name: str, values: dict[str, Value], of_scan: dict[str, Any], of_spe
         recipe = recipe_of(Path(name), of_scan, of_spectrum)
         return Recipe({**recipe.surface, **values}, recipe.settings, recipe.folder)
     if is_scan(name):
-        recipe = recipe_of(Path(name), of_scan, {"extent": "sample", **of_spectrum})  # rarely cut to whole periods
+        recipe = recipe_of(Path(name), of_scan, of_spectrum)
         unknown, wanted = list(values), "the options of a scan, such as --pixel-size"
     else:
         recipe = Recipe.of_profile(name, values, **of_spectrum)

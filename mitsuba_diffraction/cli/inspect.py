@@ -53,10 +53,7 @@ def inspect(
     angles, views = angles_of("--angle", angle), np.zeros(0) if view is None else angles_of("--view", view)
     if view is None and angle != "0":
         raise RequestError(f"--angle: got {angle} without --view, wanted the angles of the viewer, too")
-    settings = settings_of(context)
-    if source.suffix.lower() != ".toml":
-        settings.setdefault("extent", "sample")
-    recipe = recipe_of(source, options_of_scan(context), settings)
+    recipe = recipe_of(source, options_of_scan(context), settings_of(context))
     reads = [source, *recipe.files]
     default_name = free_name(f"{source.stem}_inspect", lambda stem: [Path(f"{stem}.png")], reads)
     picture = output or Path(f"{default_name}.png")

@@ -69,7 +69,7 @@ def precompute(
             f"--pixel-size: got {pixel_size:g} µm, wanted at most the coherence length, {max_pixel_size:g} µm: with "
             "larger pixels there is a single height within the coherence length, and no diffraction"
         )
-    recipes = [recipe_of(source, options_of_scan(context), settings) for source in sources]
+    recipes = [recipe_of(source, options_of_scan(context), settings, "tile") for source in sources]
     reads = [*sources, *(file for recipe in recipes for file in recipe.files)]
     writes = [("-o" if output else f"spectrum of {s}", t) for s, t in zip(sources, targets, strict=True)]
     check_outputs(reads, writes, overwrite=overwrite)

@@ -6,7 +6,7 @@ import functools
 import shlex
 import webbrowser
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Any
 
 import typer
 
@@ -19,6 +19,7 @@ from .arguments import (
     SCAN_OPTIONS,
     Overwrite,
     check_suffix,
+    given_of,
     is_film,
     is_scan,
     options_of_scan,
@@ -55,8 +56,7 @@ def view(
     of_scan, settings = options_of_scan(context), settings_of(context)
     recipe, of_a_scan = None, is_scan(name)
     if of_a_scan or of_scan or settings:
-        # A scan is rarely cut to a whole number of periods.
-        recipe = recipe_of(path, of_scan, {"extent": "sample", **settings} if of_a_scan else settings)
+        recipe = recipe_of(path, of_scan, settings)
     reads = [file for file in (path, reference) if file is not None and file.exists()]
     check_outputs([*reads, *(recipe.files if recipe else [])], [("-o", target)], overwrite=overwrite)
     picture = None if reference is None else reference_picture(reference)
@@ -64,7 +64,7 @@ def view(
         surface = Surface.named(name, parameters, progress)
     else:
         spectrum = f"{path.stem}.exr"
-        options = _given(context) + (["--extent", "sample"] if of_a_scan and "extent" not in settings else [])
+        options = _words(given_of(context, SCAN_OPTIONS) | ({"extent": recipe.settings.extent} if of_a_scan else {}))
         command = shlex.join([NAME, "precompute", path.name, *options, "-o", spectrum])
         surface = Surface.of_recipe(recipe, path.stem, {"filename": spectrum}, parameters, progress, command)
     if is_film(name):
@@ -79,15 +79,11 @@ def view(
         webbrowser.open(target.resolve().as_uri())
 
 
-def _given(context: typer.Context) -> list[str]:
-    """Return the given options of the scan and its spectrum as words."""
+def _words(options: dict[str, Any]) -> list[str]:
+    """Return options of the command line as words."""
     words = []
-    for name in SCAN_OPTIONS:
-        value, option = context.params[name], f"--{name.replace('_', '-')}"
-        if value is True:
-            words.append(option)
-        elif value is not None and value is not False:
-            words += [
-                word for item in (value if isinstance(value, list | tuple) else [value]) for word in (option, str(item))
-            ]
+    for name, value in options.items():
+        option = f"--{name.replace('_', '-')}"
+        for item in value if isinstance(value, list | tuple) else [value]:
+            words += [option] if item is True else [option, str(item)]
     return words

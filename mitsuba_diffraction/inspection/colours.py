@@ -169,11 +169,21 @@ class Change:
 
 
 class _View(NamedTuple):
-    """A surface: its spectrum, its period, and how it is scaled."""
+    """A surface at normal incidence: its spectrum, its main period and the direction of that, and how it is scaled."""
 
     spectrum: GratingSpectrum
+    direction: float
     period: float
     scale: Mapping[str, float] = {}
+
+    def fraction(self, order: int) -> float:
+        """Return `order_fraction` at 550 nm."""
+        return order_fraction(self.spectrum, self.direction, self.period, order, GREEN, **self.scale)
+
+    def XYZ(self, theta_o: float) -> Array:
+        """Return non-negative XYZ in a direction, degrees."""
+        spectra = radiance(self.spectrum, self.direction, 0.0, theta_o, **self.scale)
+        return np.maximum(spectrum_to_XYZ(spectra, WAVELENGTHS), 0)
 
 
 def changes(
@@ -194,34 +204,32 @@ def changes(
     periods and spectrum are computed again, by `build`, with the same settings. The spectrum must be valid for
     wavelengths from 360 nm/1.05.
     """
-    orders = [m for m in ORDERS if order_angle(m, main.period, GREEN) is not None]
-    before = _View(spectrum, main.period)
-    brighter = {m: max((m, -m), key=lambda order: _XYZ(before, main, order, main.period)[1]) for m in orders}
-    fractions = {m: _fraction(before, main, m) for m in orders}
-    colours = {m: _XYZ(before, main, brighter[m], main.period) for m in orders}
+    angles = {m: angle for m in ORDERS if (angle := order_angle(m, main.period, GREEN)) is not None}
+    before = _View(spectrum, main.direction, main.period)
+    views = {m: max((angle, -angle), key=lambda theta_o: before.XYZ(theta_o)[1]) for m, angle in angles.items()}
+    fractions = {m: before.fraction(m) for m in views}
+    colours = {m: before.XYZ(theta_o) for m, theta_o in views.items()}
     brightest = max((XYZ[1] for XYZ in colours.values()), default=1.0)
     exposure = 0.5 / brightest if brightest > 0 else 1.0
 
     def change(what: str, by: float, after: _View, tip_radius: float = float("nan")) -> Change:
-        new_fractions = {m: _fraction(after, main, m) for m in orders}
-        colour = {
-            m: float(delta_E(exposure * colours[m], exposure * _XYZ(after, main, brighter[m], main.period)))
-            for m in orders
-        }
+        new_fractions = {m: after.fraction(m) for m in views}
+        colour = {m: float(delta_E(exposure * colours[m], exposure * after.XYZ(views[m]))) for m in views}
         return Change(what, by, after.period / main.period - 1, fractions, new_fractions, colour, tip_radius)
 
     found = []
     for by in (CHANGE, -CHANGE):
-        found.append(change("height scale", by, _View(spectrum, main.period, {"height_scale": 1 + by})))
+        found.append(change("height scale", by, before._replace(scale={"height_scale": 1 + by})))
     for by in (CHANGE, -CHANGE):
-        found.append(change("pixel size", by, _View(spectrum, main.period * (1 + by), {"lateral_scale": 1 + by})))
+        wider = before._replace(period=main.period * (1 + by), scale={"lateral_scale": 1 + by})
+        found.append(change("pixel size", by, wider))
     for by in (CHANGE, -CHANGE) if measured else ():
         try:
             other, radius = broadened(height_field, by, extent=extent)
         except RequestError:
             continue  # steps between adjacent pixels, which no tip explains
         period = same_period(find_periods(other, extent=extent), main).period
-        found.append(change("tip broadening", by, _View(build(other), period), radius))
+        found.append(change("tip broadening", by, before._replace(spectrum=build(other), period=period), radius))
     return tuple(found)
 
 
@@ -233,18 +241,6 @@ def same_period(found: tuple[Period, ...], main: Period) -> Period:
 
     nearest = min(found, key=angle, default=main)
     return nearest if angle(nearest) < 10 else main
-
-
-def _fraction(view: _View, main: Period, order: int) -> float:
-    return order_fraction(view.spectrum, main.direction, view.period, order, GREEN, **view.scale)
-
-
-def _XYZ(view: _View, main: Period, order: int, period: float) -> Array:
-    """Return non-negative XYZ at normal incidence in the direction to which `period` diffracts 550 nm."""
-    angle = order_angle(order, period, GREEN)
-    assert angle is not None  # evanescent orders were left out
-    spectra = radiance(view.spectrum, main.direction, 0.0, angle, **view.scale)
-    return np.maximum(spectrum_to_XYZ(spectra, WAVELENGTHS), 0)
 
 
 _HALVINGS = 12  # of the interval of tip radii

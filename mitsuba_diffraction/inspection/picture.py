@@ -242,13 +242,11 @@ def _colours(rows: list[Axes], inspection: Inspection) -> None:
     shown = on_screen(rgb * auto_exposure(np.concatenate(off_specular)))
     for axes, strip, incidence in zip(rows, shown, INCIDENCES, strict=True):
         axes.imshow(strip[None], extent=(-90, 90, 0, 1), aspect="auto", interpolation="bilinear")
-        axes.set_yticks([])
-        axes.set_xlim(-90, 90)
+        axes.set(xlim=(-90, 90), xticks=np.arange(-90, 91, 30), xticklabels=[], yticks=[])
         axes.set_ylabel(f"light at {incidence:g}°", rotation=0, ha="right", va="center", fontsize=10.5)
-        axes.set_xticks(np.arange(-90, 91, 30), labels=[] if axes is not rows[-1] else None)
         axes.plot([incidence], [1.0], marker="v", ms=9, color="black", clip_on=False)
     rows[-1].tick_params(labelsize=9.5)
-    rows[-1].set_xticks(np.arange(-90, 91, 30), labels=[f"{angle}°".replace("-", "−") for angle in range(-90, 91, 30)])
+    rows[-1].set_xticklabels([f"{angle}°".replace("-", "−") for angle in range(-90, 91, 30)])
     rows[-1].set_xlabel(
         "viewing angle from the surface's normal, across the lines (positive: opposite to the light)",
         fontsize=10,

@@ -47,11 +47,10 @@ class Design:
         """Predict the far field of texels of the given heights, (texels, texels) µm."""
         field = _relief(heights, plate)
         predicted, mirror = _far_field(field, plate, plate.wavelengths, wanted.shape[1])
-        changed = {
-            name: _efficiency(_far_field(_relief(*scaled), plate, plate.wavelengths, wanted.shape[1])[0], wanted)
-            for name, (depth, blur) in _ERRORS.items()
-            for scaled in [(depth * heights, plate, blur)]
-        }
+        changed = {}
+        for name, (depth, blur) in _ERRORS.items():
+            relief = _relief(depth * heights, plate, blur)
+            changed[name] = _efficiency(_far_field(relief, plate, plate.wavelengths, wanted.shape[1])[0], wanted)
         return cls(field, plate, wanted, predicted, mirror, changed, interrupted)
 
     @property

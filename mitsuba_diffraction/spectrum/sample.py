@@ -61,17 +61,16 @@ def effective_coherence_length(height_field: HeightField, requested: float) -> f
     return effective
 
 
-def window_axes(height_field: HeightField, coherence_length: float) -> tuple[WindowAxis | None, WindowAxis | None]:
-    """Return the windows along x and y for a coherence length (µm) that the scan supports; None for a one-pixel axis.
+def window_axes(height_field: HeightField, coherence_length: float) -> list[WindowAxis]:
+    """Return the windows along x and y for a coherence length (µm) that the scan supports; `UNIFORM` for one pixel.
 
     a(x) = exp(−x²/2σ_s²) with σ_s = L_c/4, about the centre of its support, 6σ_s rounded up to whole pixels. The
     positions are evenly spaced from edge to edge of the scan, at most σ_s apart, rounded to whole pixels.
     """
-    along_x, along_y = (
-        _axis(count, pixel, coherence_length / 4) if count > 1 else None
+    return [
+        _axis(count, pixel, coherence_length / 4) if count > 1 else UNIFORM
         for count, pixel in zip(height_field.shape[::-1], height_field.pixel_size, strict=True)
-    )
-    return along_x, along_y
+    ]
 
 
 def mean_periodogram(
@@ -120,11 +119,11 @@ class _Lags:
     """One axis: the lags τ of the autocorrelation, and the frequency lattice of its transform."""
 
     def __init__(
-        self, axis: WindowAxis | None, pixel: float, coherence_length: float, spacing: float, max_frequency: float
-    ):
-        self.axis = axis
+        self, axis: WindowAxis, pixel: float, coherence_length: float, spacing: float, max_frequency: float
+    ) -> None:
+        self.axis, self.is_uniform = axis, axis is UNIFORM
         sigma = lobe_width(coherence_length)
-        if axis is None:
+        if self.is_uniform:
             pixel, max_frequency = 1 / (4 * _UNIFORM_SIGMAS * sigma), _UNIFORM_SIGMAS * sigma
             lags = int(np.ceil(6 * coherence_length / 4 * np.sqrt(2) / pixel))
         else:
@@ -132,12 +131,11 @@ class _Lags:
         # The lattice must resolve the longest lag.
         self.count = scipy.fft.next_fast_len(max(int(np.ceil(1 / (spacing * pixel))), 2 * lags + 1), real=True)
         self.spacing = 1 / (self.count * pixel)
-        self.limit = np.inf if axis is None else 1 / (2 * pixel)
+        self.limit = np.inf if self.is_uniform else 1 / (2 * pixel)
         self.max_q = min(max_frequency, self.limit)
         # At the last frequency, too, three nodes contribute.
         self.max_order = int(np.rint(self.max_q / self.spacing)) + 1
         self.lags = np.arange(-lags, lags + 1)
-        self.pixel = pixel
         # The least-squares projection on splines: the transform of B over that of its autocorrelation at integers.
         x = self.lags / self.count
         self.projection = np.sinc(x) ** 3 * 60 / (33 + 26 * np.cos(2 * np.pi * x) + np.cos(4 * np.pi * x))
@@ -167,7 +165,7 @@ class SamplePowers:
             for axis, pixel in zip(window_axes(height_field, coherence_length), height_field.pixel_size, strict=True)
         ]
         x, y = self._lags
-        self._windows = x.axis or UNIFORM, y.axis or UNIFORM
+        self._windows = x.axis, y.axis
         self.transforms = len(self._windows[0].starts) * len(self._windows[1].starts)
         self.grid = SplineGrid((x.spacing, y.spacing), (x.max_order, y.max_order), (x.limit, y.limit))
         self._max_q = x.max_q, y.max_q
@@ -183,9 +181,9 @@ class SamplePowers:
         half = half[np.arange(-height + 1, height) % shape[0], :width]
         x, y = self._lags
         # Along a uniform axis the single row or column is extended by the autocorrelation of the window.
-        if y.axis is None:
+        if y.is_uniform:
             half = half * y.uniform[:, None]
-        if x.axis is None:
+        if x.is_uniform:
             half = half * x.uniform[x.lags >= 0]
         return half
 
@@ -255,7 +253,7 @@ def standard_error(
         max_kappa: κ up to which S is wanted, rad/µm.
         max_frequency: largest |q_x| and |q_y| that light reaches, cycles/µm.
     """
-    axes = [axis or UNIFORM for axis in window_axes(height_field, coherence_length)]
+    axes = window_axes(height_field, coherence_length)
     correlation, within = 1.0, 1.0
     for axis in axes:
         rho = _correlation(axis)
@@ -263,17 +261,15 @@ def standard_error(
         within *= sum(rho[np.ix_(batch, batch)].sum() / len(batch) for batch in _batches(axis)) / len(axis.starts)
     if within - correlation < 1e-12:
         return 0.0  # a single pixel
-    inside = [
+    inside_x, inside_y = (
         np.abs(scipy.fft.fftfreq(len(axis.window), pixel)) <= max_frequency
-        if len(axis.window) > 1
-        else np.ones(1, bool)
         for axis, pixel in zip(axes, height_field.pixel_size, strict=True)
-    ]
+    )
     errors = []
     for kappa in max_kappa * np.arange(1, _KAPPA_COUNT + 1) / _KAPPA_COUNT:
         variance = _batch_variance(phase_wave(height_field, kappa), axes) * correlation / (within - correlation)
         smooth = scipy.ndimage.uniform_filter(variance, 3, mode="wrap")
-        errors.append(inside[1] @ np.sqrt(np.maximum(smooth, 0)) @ inside[0])
+        errors.append(inside_y @ np.sqrt(np.maximum(smooth, 0)) @ inside_x)
     return float(max(errors))
 
 

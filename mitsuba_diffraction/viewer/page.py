@@ -18,7 +18,7 @@ from ..outputs import MARK
 from ..rigorous.materials import conductor
 from ..settings import FROM_RADIUS, SUN_COHERENCE_LENGTH, VISIBLE
 from ..spectrum.grids import OrderGrid
-from ..spectrum.sample import UNIFORM, effective_coherence_length, window_axes
+from ..spectrum.sample import effective_coherence_length, window_axes
 from ..spectrum.tables import HALF_SCALE, SliceTable
 from ..surface.heightfield import HeightField
 from .arrays import encoded
@@ -200,8 +200,7 @@ def _windows(sample: HeightField, coherence_length: float) -> dict[str, Any]:
     """Return the coherence length that a sample supports, and Σ_p a²(x − x_p) of its windows along x and y."""
     length = effective_coherence_length(sample, coherence_length)
     squares = []
-    for axis, count in zip(window_axes(sample, length), sample.shape[::-1], strict=True):
-        window, starts = axis or UNIFORM
+    for (window, starts), count in zip(window_axes(sample, length), sample.shape[::-1], strict=True):
         sums = np.zeros(count)
         for start in starts:
             sums[start : start + len(window)] += window**2

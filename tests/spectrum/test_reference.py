@@ -223,7 +223,7 @@ def averaged_periodogram(field, q, kappa, coherence_length):
     for count, pixel, axis in zip(
         field.shape[::-1], field.pixel_size, window_axes(field, coherence_length), strict=True
     ):
-        if axis is None:
+        if count == 1:
             starts.append([0])
             windows.append(np.ones(1))
             continue

@@ -6,7 +6,13 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from mitsuba_diffraction import HeightField
-from mitsuba_diffraction.spectrum.sample import WindowAxis, effective_coherence_length, mean_periodogram, window_axes
+from mitsuba_diffraction.spectrum.sample import (
+    UNIFORM,
+    WindowAxis,
+    effective_coherence_length,
+    mean_periodogram,
+    window_axes,
+)
 
 
 def flat(rows, columns, pixel):
@@ -61,8 +67,8 @@ def test_windows_are_gaussian_and_cover_the_scan(count, pixel, fraction):
     # From four pixels to half of the scan.
     coherence_length = (4 + fraction * (count / 2 - 4)) * pixel
     sigma = coherence_length / 4 / pixel  # pixels
-    axis, none = window_axes(flat(1, count, (pixel, 1.0)), coherence_length)
-    assert none is None
+    axis, across = window_axes(flat(1, count, (pixel, 1.0)), coherence_length)
+    assert across is UNIFORM
     width = len(axis.window)
     assert 0 <= width - 6 * sigma + 1e-6 <= 1 + 2e-6  # three σ_s to each side, in whole pixels
     # ln a is the parabola −x²/2σ_s² about the middle, up to its height, and Σ a² = 1.
@@ -95,8 +101,8 @@ def test_each_axis_has_windows_of_its_own():
     assert len(along_y.window) == 30
     assert along_x.starts[-1] == 40
     assert along_y.starts[-1] == 10
-    assert window_axes(flat(1, 1, 0.1), 4.0) == (None, None)
-    assert window_axes(flat(40, 1, 0.1), 1.0)[0] is None
+    assert window_axes(flat(1, 1, 0.1), 4.0) == [UNIFORM, UNIFORM]
+    assert window_axes(flat(40, 1, 0.1), 1.0)[0] is UNIFORM
 
 
 @pytest.mark.parametrize("shape", [(4, 5), (7, 12)])
