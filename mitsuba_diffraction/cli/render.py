@@ -142,37 +142,27 @@ def render(
         size = 1 if not _is_spectral(target) else 4 if single and not rgb else 2
         request["announce"] = partial(_announce, scene.name, size, 3 + alpha, written, named)
     pictures = _pictures(target, frames)
+    # By default the exposure of the first picture is that of all.
     factor = None if exposure is None else 2**exposure
-    options = {"resume": resume, "stored": stored, "denoise": denoise, "view": shown}
     with durations():
-        _render(scene, pictures, motions, where, request, factor, **options)
+        for number, (path, motion) in enumerate(zip(pictures, motions, strict=True)):
+            factor = _picture(
+                scene,
+                path,
+                {**where, "motion": motion},
+                request,
+                resume=resume,
+                stored=stored,
+                denoise=denoise,
+                view=shown,
+                label=scene.name if len(pictures) == 1 else f"{scene.name} {number + 1}/{len(pictures)}",
+                exposure=factor,
+                complete=f"{number} of {len(pictures)} pictures are complete" if number else None,
+            )
         if frames is not None:
             animation = target.with_suffix(".webp")
             save_animation([_preview(path) for path in pictures], animation)
             tell(f"{animation}: animated preview, {frames} frames")
-
-
-def _render(
-    scene: Path,
-    pictures: list[Path],
-    motions: list[tuple[float, ...]] | list[None],
-    where: dict[str, Any],
-    request: dict[str, Any],
-    exposure: float | None,
-    **options: Any,
-) -> None:
-    """Render a picture for each motion of the camera, all with the same exposure, by default that of the first."""
-    for number, (path, motion) in enumerate(zip(pictures, motions, strict=True)):
-        exposure = _picture(
-            scene,
-            path,
-            {**where, "motion": motion},
-            request,
-            label=scene.name if len(pictures) == 1 else f"{scene.name} {number + 1}/{len(pictures)}",
-            exposure=exposure,
-            complete=f"{number} of {len(pictures)} pictures are complete" if number else None,
-            **options,
-        )
 
 
 def _announce(
@@ -283,7 +273,7 @@ def _picture(
     from ..render.passes import Finished, Interrupted, checkpoint_path, discard_checkpoints
     from ..render.passes import render as trace
     from ..render.scene import load_spectral_scene
-    from ..render.spectral_image import exposure_of_preview, save_preview, stored_digest
+    from ..render.spectral_image import exposure_of_preview, save_preview, stored_digest, wider_hats
 
     start = time.perf_counter()
     checkpoint, preview = checkpoint_path(path), _preview(path)
@@ -328,7 +318,12 @@ def _picture(
         spp = image.attributes["spp"]
         raise Stopped(f"{path} holds {spp} samples per pixel; the same command with --resume continues")
     discard_checkpoints(checkpoint)
-    channels = _channels(image, **stored) if _is_spectral(path) else "8 bits"
+    channels = "8 bits"
+    if _is_spectral(path):
+        count = (
+            image.shape[2] if stored["channels"] is None else wider_hats(image.shape[2], stored["channels"]).shape[1]
+        )
+        channels = "RGB" if stored["rgb"] else f"{count} wavelengths"
     exposed = f"exposed by {(stops := math.log2(exposure)):+.2f} stops (--exposure {stops:.2f})"
     tell(
         f"{path}: {_summary(image, request['until_error'], channels)}, "
@@ -336,16 +331,6 @@ def _picture(
         + (f"\n{preview}: preview, {exposed}" if _is_spectral(path) else f", {exposed}")
     )
     return exposure
-
-
-def _channels(image: SpectralImage, *, half: bool | None, rgb: bool, channels: int | None) -> str:
-    """Return the channels of a picture as stored by `SpectralImage.save`."""
-    from ..render.spectral_image import wider_hats
-
-    wavelengths = image.shape[2]
-    if channels is not None:
-        wavelengths = wider_hats(wavelengths, channels).shape[1]
-    return "RGB" if rgb else f"{wavelengths} wavelengths"
 
 
 def _summary(image: SpectralImage, until_error: float | None, channels: str) -> str:

@@ -168,11 +168,8 @@ def lamellar(period: float, depth: float, *, duty: float = 0.5, samples: int = 5
 def crossed(period: float, depth: float, *, period_y: float | None = None, samples: int = 128) -> HeightField:
     """Return the sum of sinusoids along x and y, (samples, samples): the orders are products |F_{m_x}|² |F_{m_y}|².
 
-    Args:
-        period: along x, µm.
-        depth: peak to valley of *each* sinusoid, µm; their sum spans twice that.
-        period_y: along y, µm; default: that along x.
-        samples: pixels per period in either direction.
+    `depth` is that of *each* sinusoid; their sum spans twice that. `period_y`, along y, is by default that along x;
+    both have as many `samples`.
     """
     check_profile(period, depth, samples)
     check_pixels(samples, samples)
@@ -352,8 +349,6 @@ def compact_disc(
         channel_bit: length of a channel bit along the track, µm.
         tracks: number of tracks; times the period, the size of the patch along x.
         length: of the patch along y, µm, at least four pits, rounded to whole channel bits.
-        pixel_size: µm, at most half of the width.
-        seed: of the lengths of pits and lands.
     """
     return draw_tracks(
         "compact disc", EIGHT_TO_FOURTEEN, period, depth, width, channel_bit, tracks, length, pixel_size, seed
