@@ -34,6 +34,9 @@ FORMAT_VERSION = 10
 
 # Attributes and their names in files.
 _NUMBERS = {
+    "coherence_length": "coherenceLength",
+    "largest_angle": "largestAngle",
+    "tolerance": "tolerance",
     "height_range": "heightRange",
     "error": "error",
     "truncated_power": "dropped",
@@ -86,10 +89,7 @@ class GratingSpectrum(PowerSpectrum):
         header: dict[str, Any] = {
             "representation": self.representation,
             "extent": self.extent,
-            "coherenceLength": doubles(self.coherence_length),
             "wavelengths": doubles(*self.wavelengths),
-            "largestAngle": doubles(self.largest_angle),
-            "tolerance": doubles(self.tolerance),
             "pixelSize": doubles(*self.pixel_size),
             **(
                 {"tileSize": doubles(*grid.tile_size)}
@@ -111,7 +111,7 @@ class GratingSpectrum(PowerSpectrum):
 
     @classmethod
     def load(cls, path: str | os.PathLike[str], recipe: str | None = None) -> GratingSpectrum:
-        """Read a spectrum that `save` wrote.
+        """Read a spectrum that `save` wrote; `recipe` is the digest of the one from which it must have been built.
 
         Raises:
             FileNotFoundError: if there is no such file.
@@ -136,17 +136,15 @@ class GratingSpectrum(PowerSpectrum):
             series: dict[str, Any] = {}
             if isinstance(table, AmplitudeTable):
                 series = {"terms": header["channelCount"] // 2, "heights_from": header["heightsFrom"]}
-            settings = Settings(
-                header["extent"],
-                _single(header["coherenceLength"]),
-                _pair(header["wavelengths"]),
-                _single(header["largestAngle"]),
-                header["representation"],
-                _single(header["tolerance"]),
-                **series,
-            )
             entries: dict[str, Any] = {name: header[key] for name, key in _OTHERS.items()}
             entries |= {name: _single(header[key]) for name, key in _NUMBERS.items()}
+            settings = Settings(
+                extent=header["extent"],
+                wavelengths=_pair(header["wavelengths"]),
+                representation=header["representation"],
+                **{name: entries.pop(name) for name in ("coherence_length", "largest_angle", "tolerance")},
+                **series,
+            )
             return cls(
                 table=table,
                 grid=_grid(header, table.shape),

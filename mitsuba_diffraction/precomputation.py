@@ -120,16 +120,7 @@ def build_spectrum(patches: Sequence[HeightField], settings: Settings, progress:
 
 
 def load_spectrum(path: str | os.PathLike[str], recipe: str | None = None) -> Spectrum:
-    """Read a spectrum that `save` wrote.
-
-    Args:
-        path: the file.
-        recipe: the digest of the recipe from which it must have been built.
-
-    Raises:
-        FileNotFoundError: if there is no such file.
-        ValueError: if it is not a spectrum, is damaged, of another version, or was not built from that recipe.
-    """
+    """Read a spectrum of either theory; arguments and errors of `GratingSpectrum.load`."""
     return (RigorousSpectrum if is_rigorous(path) else GratingSpectrum).load(path, recipe)
 
 

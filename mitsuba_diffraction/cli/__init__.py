@@ -1,6 +1,5 @@
 """Command line: one file per command, which parses arguments, calls the package and prints the result.
 
-
 Exit codes: 0 done; 1 the work failed; 2 the request was wrong; 130 interrupted.
 """
 

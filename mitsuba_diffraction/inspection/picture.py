@@ -46,8 +46,10 @@ def save_picture(inspection: Inspection, path: str | os.PathLike[str], *, title:
     if Path(path).suffix.lower().removeprefix(".") not in kinds:
         raise RequestError(f"picture: got {os.fspath(path)!r}, wanted a file name that ends in .png, .pdf or .svg")
     source = inspection.height_field.source
-    figure.text(0.04, 0.95, _short(title or source, 80), fontsize=17, weight="bold", va="center")
-    below = [_headline(inspection)] if title in (None, source) else [_short(source, 150), _headline(inspection)]
+    heading = textwrap.shorten(title or source, 80, placeholder=" …")
+    figure.text(0.04, 0.95, heading, fontsize=17, weight="bold", va="center")
+    below = [] if title in (None, source) else [textwrap.shorten(source, 150, placeholder=" …")]
+    below.append(_headline(inspection))
     figure.text(0.04, 0.927, "\n".join(below), fontsize=11, color="0.25", va="top", linespacing=1.35)
     top = {"top": 0.82, "bottom": 0.41}
     left, middle, right = (
@@ -61,10 +63,6 @@ def save_picture(inspection: Inspection, path: str | os.PathLike[str], *, title:
     _colours([figure.add_subplot(row) for row in lower], inspection)
     with whole_file(path) as temporary:
         figure.savefig(temporary, metadata=METADATA)
-
-
-def _short(text: str, length: int) -> str:
-    return textwrap.shorten(text, length, placeholder=" …")
 
 
 def _headline(inspection: Inspection) -> str:
@@ -146,8 +144,11 @@ def _round_length(length: float) -> float:
 
 
 def _spectrum(axes: Axes, inspection: Inspection) -> None:
-    """Plot the power spectrum of the heights, in which a wave is a pair of bright spots."""
-    q_x, q_y, power = _height_spectrum(_shown(inspection), inspection.extent)
+    """Plot the power spectrum of the levelled heights under a Hann window, in which a wave is a pair of spots."""
+    field = _shown(inspection)
+    level = field.heights - reference_plane(field, inspection.extent)[0]
+    power = np.fft.fftshift(np.abs(np.fft.fft2(level * hann(level.shape))) ** 2)
+    q_y, q_x = (np.fft.fftshift(np.fft.fftfreq(n, p)) for n, p in zip(level.shape, field.pixel_size[::-1], strict=True))
     limit = min(_MAX_FREQUENCY, max(q_x.max(), q_y.max()))
     if inspection.periods:
         limit = min(limit, 4.5 / inspection.periods[0].period)
@@ -178,15 +179,6 @@ def _spectrum(axes: Axes, inspection: Inspection) -> None:
             fontsize=11,
             bbox={"facecolor": "black", "alpha": 0.6, "edgecolor": "none", "pad": 2},
         )
-
-
-def _height_spectrum(field: HeightField, extent: str) -> tuple[Array, Array, Array]:
-    """Return ascending q_x, q_y and the power of levelled, Hann-windowed heights, at most about 1000² points."""
-    level = field.heights - reference_plane(field, extent)[0]
-    power = np.fft.fftshift(np.abs(np.fft.fft2(level * hann(level.shape))) ** 2)
-    q_y, q_x = (np.fft.fftshift(np.fft.fftfreq(n, p)) for n, p in zip(level.shape, field.pixel_size[::-1], strict=True))
-    keep_x, keep_y = np.abs(q_x) <= _MAX_FREQUENCY * 1.01, np.abs(q_y) <= _MAX_FREQUENCY * 1.01
-    return q_x[keep_x], q_y[keep_y], power[np.ix_(keep_y, keep_x)]
 
 
 def _strongest(q_x: Array, q_y: Array, power: Array) -> tuple[Array, Array, Array]:

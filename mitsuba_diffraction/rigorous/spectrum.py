@@ -438,11 +438,7 @@ class RigorousSpectrum:
         return m, self.evaluate(m, alpha - m / 2, g, wavelength, (side_i, side_o))
 
     def save(self, path: str | os.PathLike[str], recipe: str = "") -> None:
-        """Write the spectrum as an OpenEXR file, atomically; `recipe` is the digest of its `Recipe`.
-
-        Raises:
-            OSError: if the file cannot be written.
-        """
+        """Write the spectrum as an OpenEXR file; argument and errors of `GratingSpectrum.save`."""
         axes = self.axes
         index = complex(self.int_ior)
         arrays = {"eta": self.values.reshape(axes.rows, -1)}
@@ -466,12 +462,7 @@ class RigorousSpectrum:
 
     @classmethod
     def load(cls, path: str | os.PathLike[str], recipe: str | None = None) -> RigorousSpectrum:
-        """Read a spectrum that `save` wrote.
-
-        Raises:
-            FileNotFoundError: if there is no such file.
-            ValueError: if the file is not a rigorous spectrum, is damaged, or was not built from that recipe.
-        """
+        """Read a spectrum that `save` wrote; arguments and errors of `GratingSpectrum.load`."""
         path = Path(path)
         header, channels = read(path, FORMAT, FORMAT_VERSION, recipe)
         try:

@@ -141,14 +141,7 @@ def read_height_field(
 
 
 def _check_scale(field: HeightField, levelled: bool) -> None:
-    """Check that a scan can have its pixels, its size and its heights; one still to be levelled may be tilted.
-
-    Raises:
-        RequestError: if pixels or size cannot be right.
-
-    Warns:
-        UserWarning: if the heights cannot.
-    """
+    """Refuse pixels or a size that no scan has, and warn of such heights; one still to be levelled may be tilted."""
     (x, y), size = field.pixel_size, max(field.tile_size)
     if not (min(x, y) >= _MIN_PIXEL and max(x, y) <= _MAX_PIXEL and size <= _MAX_FIELD):
         raise RequestError(
