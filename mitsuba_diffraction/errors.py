@@ -1,11 +1,11 @@
-"""Classes of exceptions: mistakes of the caller, failures of the environment, bugs of this package."""
+"""Exceptions: mistakes of the caller, failures of the environment, bugs of this package; checks of numbers."""
 
 from __future__ import annotations
 
 import builtins
 import re
 import sys
-from numbers import Real
+from numbers import Integral, Real
 from typing import Any
 
 # Mitsuba reports an exception of a Python plugin as text: the location of the plugin in the scene, indented lines of
@@ -36,6 +36,14 @@ def is_number(value: object) -> bool:
         return False
     size: Any = abs(value)  # numbers of any kind can be compared
     return bool(size <= sys.float_info.max)
+
+
+def check_whole(name: str, value: Any, minimum: int, maximum: int | None = None) -> None:
+    """Raise RequestError unless a parameter is a whole number in a range."""
+    whole = isinstance(value, Integral) and not isinstance(value, bool)
+    if not (whole and value >= minimum and (maximum is None or value <= maximum)):
+        wanted = f"of at least {minimum}" if maximum is None else f"from {minimum} to {maximum}"
+        raise RequestError(f"{name}: got {value!r}, wanted a whole number {wanted}")
 
 
 def root_cause(error: BaseException) -> str:

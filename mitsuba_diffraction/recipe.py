@@ -46,7 +46,7 @@ from functools import cached_property
 from pathlib import Path
 from typing import Any
 
-from .errors import RequestError
+from .errors import RequestError, check_whole
 from .files import cache_folder, refuse_special
 from .grating_spectrum import FORMAT_VERSION, GratingSpectrum
 from .precomputation import Spectrum, build_spectrum, load_spectrum
@@ -114,8 +114,7 @@ class Recipe:
             raise RequestError(f"profile: got {self.surface['profile']!r}, wanted one of {', '.join(PROFILES)}")
         if "profile" in self.surface and "patches" in self.surface:
             patches = self.surface["patches"]
-            if isinstance(patches, bool) or not isinstance(patches, int) or patches < 1:
-                raise RequestError(f"patches: got {patches!r}, wanted a whole number of at least 1")
+            check_whole("patches", patches, 1)
             if "seed" not in inspect.signature(PROFILES[self.surface["profile"]]).parameters:
                 raise RequestError(
                     f"patches: got {patches!r} of the profile {self.surface['profile']!r}, wanted a profile with a seed"

@@ -10,7 +10,7 @@ import numpy as np
 import scipy.special
 from numpy.typing import ArrayLike, NDArray
 
-from .errors import RequestError, is_number
+from .errors import RequestError, check_whole, is_number
 
 MIN_WAVELENGTH = 50.0  # nm, of a spectrum
 VISIBLE = (360.0, 830.0)  # nm: the range of the CIE 1931 observer, from which Mitsuba draws wavelengths
@@ -153,11 +153,8 @@ class Settings:
                 f"representation: got {self.representation!r} with extent {self.extent!r}, wanted 'slices': an average "
                 "has no amplitude"
             )
-        count = self.terms
-        if count is not None and not (
-            isinstance(count, int) and not isinstance(count, bool) and 1 <= count <= MAX_TERMS
-        ):
-            raise RequestError(f"terms: got {count!r}, wanted a whole number from 1 to {MAX_TERMS}")
+        if self.terms is not None:
+            check_whole("terms", self.terms, 1, MAX_TERMS)
 
     @property
     def chosen(self) -> dict[str, Any]:

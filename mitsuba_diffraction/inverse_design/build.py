@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from numbers import Integral
 
 import numpy as np
 import scipy.fft
@@ -12,7 +11,7 @@ import scipy.ndimage
 import scipy.optimize
 from numpy.typing import ArrayLike, NDArray
 
-from ..errors import RequestError
+from ..errors import RequestError, check_whole
 from ..progress import Progress, silent
 from ..rigorous.efficiencies import one_thread
 from ..settings import MIN_WAVELENGTH
@@ -85,9 +84,8 @@ def design(
         levels=levels,
         tool_blur=tool_blur,
     )
-    for name, value, minimum in (("starts", starts, 1), ("seed", seed, 0)):
-        if not isinstance(value, Integral) or value < minimum:
-            raise RequestError(f"{name}: got {value!r}, wanted a whole number of at least {minimum}")
+    check_whole("starts", starts, 1)
+    check_whole("seed", seed, 0)
     wanted = wanted_fractions(target, plate)
     search = _Search(plate, wanted, starts, progress)
     interrupted = False

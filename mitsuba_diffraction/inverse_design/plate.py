@@ -4,11 +4,10 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from numbers import Integral
 
 import numpy as np
 
-from ..errors import RequestError, is_number
+from ..errors import RequestError, check_whole, is_number
 from .far_field import Array, blurred_texels
 
 _MAX_TEXELS = 256
@@ -36,9 +35,7 @@ class Plate:
             value = getattr(self, name)
             if not is_number(value) or value < 0 or (value == 0 and not zero):
                 raise RequestError(f"{name}: got {value!r}, wanted a {'' if zero else 'positive '}number of µm")
-        whole = isinstance(self.texels, Integral) and not isinstance(self.texels, bool)
-        if not (whole and 4 <= self.texels <= _MAX_TEXELS):
-            raise RequestError(f"texels: got {self.texels!r}, wanted a whole number from 4 to {_MAX_TEXELS}")
+        check_whole("texels", self.texels, 4, _MAX_TEXELS)
         if not (is_number(self.angle) and 0 < self.angle < 45):
             raise RequestError(
                 f"angle: got {self.angle!r}, wanted degrees above 0 and below 45, where the corners of the picture are "
@@ -46,8 +43,8 @@ class Plate:
             )
         if self.int_ior is not None and not (is_number(self.int_ior) and 1 < self.int_ior <= 10):
             raise RequestError(f"int_ior: got {self.int_ior!r}, wanted an index above 1, or none for a mirror")
-        if self.levels is not None and not (isinstance(self.levels, Integral) and self.levels >= 2):
-            raise RequestError(f"levels: got {self.levels!r}, wanted a whole number of at least 2")
+        if self.levels is not None:
+            check_whole("levels", self.levels, 2)
         longest = float(self.wavelengths.max()) * 1e-3
         sine = math.sin(math.radians(self.angle))
         if self.texel <= longest / 2:

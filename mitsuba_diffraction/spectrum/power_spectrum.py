@@ -10,7 +10,7 @@ from typing import cast
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from ..errors import RequestError
+from ..errors import RequestError, check_whole
 from ..settings import Settings, lobe_cutoff, lobe_width, matching
 from .grids import LobeAxis, OrderGrid, SplineGrid
 from .tables import AmplitudeTable, SliceTable
@@ -68,8 +68,7 @@ class PowerSpectrum:
         if not (0 <= self.truncated_power <= 1 and 0 <= self.unresolved_power <= 1):
             got = f"{self.truncated_power}, {self.unresolved_power}"
             raise RequestError(f"truncated_power, unresolved_power: got {got}, wanted fractions of the power")
-        if not (isinstance(self.patches, int) and self.patches >= 1):
-            raise RequestError(f"patches: got {self.patches!r}, wanted a whole number of at least 1")
+        check_whole("patches", self.patches, 1)
         found = self.standard_error
         if (found is not None) != (self.extent == "sample") or not 0 <= (found or 0.0) < np.inf:
             raise RequestError(f"standard_error: got {found} of a {self.extent}, wanted a number ≥ 0 of a sample only")

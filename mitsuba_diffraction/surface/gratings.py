@@ -16,13 +16,12 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
-from numbers import Integral
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy.special import erf
 
-from ..errors import RequestError, is_number
+from ..errors import RequestError, check_whole, is_number
 from .heightfield import HeightField, as_pixel_size
 
 MAX_PIXELS = 2**26
@@ -58,14 +57,12 @@ def check_profile(period: float, depth: float, samples: int = 2) -> None:
     check_period("period", period)
     if not (is_number(depth) and depth >= 0):
         raise RequestError(f"depth: got {depth!r}, wanted a number in µm, zero or more")
-    if not (isinstance(samples, Integral) and samples >= 2):
-        raise RequestError(f"samples: got {samples!r}, wanted a whole number of at least 2")
+    check_whole("samples", samples, 2)
     check_pixels(samples, 1)
 
 
 def generator(seed: int) -> np.random.Generator:
-    if not (isinstance(seed, Integral) and seed >= 0):
-        raise RequestError(f"seed: got {seed!r}, wanted a whole number, zero or more")
+    check_whole("seed", seed, 0)
     return np.random.default_rng(int(seed))
 
 
@@ -252,15 +249,10 @@ def draw_tracks(
 ) -> HeightField:
     """Draw a periodic patch of tracks along y, side by side along x; `runs` as above, the others as `compact_disc`."""
     check_profile(period, depth)
-    for label, value in (
-        ("width", width),
-        ("channel_bit", channel_bit),
-        ("length", length),
-        ("pixel_size", pixel_size),
-    ):
+    lengths = {"width": width, "channel_bit": channel_bit, "length": length, "pixel_size": pixel_size}
+    for label, value in lengths.items():
         check_positive(label, value)
-    if not (isinstance(tracks, Integral) and tracks >= 1):
-        raise RequestError(f"tracks: got {tracks!r}, wanted a whole number of at least 1")
+    check_whole("tracks", tracks, 1)
     shortest, longest = min(runs) * channel_bit, max(runs) * channel_bit
     if not _WALL <= width <= min(shortest, period - _WALL):
         raise RequestError(

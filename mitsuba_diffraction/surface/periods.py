@@ -21,7 +21,7 @@ from scipy import ndimage
 from scipy.fft import fft2
 from scipy.special import gammainccinv, gammaincinv
 
-from ..errors import RequestError
+from ..errors import check_whole
 from ..settings import Settings
 from .heightfield import HeightField, harmonic_fill
 
@@ -125,8 +125,7 @@ def find_periods(height_field: HeightField, count: int = 2, *, extent: str = "sa
     Raises:
         ValueError: if count is not a positive integer, or the extent is unknown.
     """
-    if isinstance(count, bool) or not isinstance(count, int | np.integer) or count < 1:
-        raise RequestError(f"count: got {count!r}, wanted a positive integer")
+    check_whole("count", count, 1)
     Settings(extent)
     if extent == "tile":
         return _periods_of_tile(height_field, count)
