@@ -74,10 +74,25 @@ def _with_short_errors(load: Callable[..., mi.Object]) -> Callable[..., mi.Objec
     return loader
 
 
+def _with_light_covered(render: Callable[..., mi.TensorXf]) -> Callable[..., mi.TensorXf]:
+    """Return `mi.render`, for sensors that are not in the scene, and lights that changed since it was loaded."""
+
+    @functools.wraps(render)
+    def renderer(
+        scene: mi.Scene, params: object = None, sensor: mi.Sensor | int = 0, *args: object, **kwargs: object
+    ) -> mi.TensorXf:
+        if isinstance(scene, mi.Scene):
+            cover_light(scene, sensor)
+        return render(scene, params, sensor, *args, **kwargs)
+
+    return renderer
+
+
 # A reload must not do this twice.
 if not getattr(mi, "_mitsuba_diffraction_registered", False):
     for name in ("load_dict", "load_file", "load_string"):
         setattr(mi, name, _with_short_errors(getattr(mi, name)))
+    mi.render = _with_light_covered(mi.render)
     mi._mitsuba_diffraction_registered = True
     # With one thread, on a machine of one core, Mitsuba 3.9.1 hangs when it reads or writes an EXR picture.
     if dr.thread_count() < 2:

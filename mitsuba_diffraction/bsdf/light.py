@@ -29,22 +29,32 @@ def wavelengths_of(film: mi.Film) -> tuple[float, float]:
     return shortest, longest
 
 
-def cover_light(scene: mi.Scene) -> None:
+def cover_light(scene: mi.Scene, sensor: mi.Sensor | int | None = None) -> None:
     """Make the gratings of a scene cover the wavelengths at which its lights emit and its films record.
+
+    Args:
+        scene: with its current parameters.
+        sensor: which renders an invisible picture, or its number; default: all sensors of the scene.
 
     Raises:
         RequestError: if the tables of one cannot; it names the range, and how to widen it.
     """
     if not is_supported(mi.variant()):
         return
+    sensors = scene.sensors()
+    if sensor is not None:
+        sensors = [sensors[sensor] if isinstance(sensor, int) else sensor]
+    ranges = [wavelengths_of(one.film()) for one in sensors]
+    first, last = min((low for low, _ in ranges), default=0), max((high for _, high in ranges), default=0)
+    if sensor is not None and VISIBLE[0] <= first and last <= VISIBLE[1]:
+        return  # covered since the scene was loaded
     gratings = {id(bsdf): bsdf for shape in scene.shapes() for bsdf in gratings_in(shape.bsdf())}
-    if not gratings or not scene.sensors():
-        return
-    ranges = [wavelengths_of(sensor.film()) for sensor in scene.sensors()]
-    first, last = min(low for low, _ in ranges), max(high for _, high in ranges)
-    for bsdf in gratings.values():
+    for bsdf in gratings.values() if sensors else ():
         shortest, longest = first, last
-        for low, high in bsdf.layers.grating.lacks((first, last)):
+        lacking = bsdf.layers.grating.lacks((first, last))
+        if sensor is not None and not lacking:
+            continue
+        for low, high in lacking:
             if not any(_emits(emitter, low, high) for emitter in scene.emitters()):
                 shortest, longest = (high, longest) if low == first else (shortest, low)
         if shortest < longest:

@@ -97,3 +97,28 @@ def test_wavelengths_without_light_need_no_table(llvm):
     line = {"type": "regular", "wavelength_min": 530.0, "wavelength_max": 534.0, "values": "1, 1"}
     grating = {"type": "diffraction_grating", "spectrum": spectrum(500, 600)}
     mi.load_dict(scene(grating, light=line))
+
+
+@pytest.mark.parametrize("change", ["another sensor", "another light"])
+def test_light_that_reaches_a_loaded_scene_is_not_black(llvm, change):
+    # Regression: a picture by a sensor that was not in the scene, or of a light that had changed, was black.
+    film, flat = (850, 950), {**GRATING, "depth": 0.05, "material": "none"}
+    if change == "another sensor":
+        loaded = mi.load_dict(scene(flat))
+        sensor = mi.load_dict(scene(flat, film)["sensor"])
+        picture = mi.render(loaded, sensor=sensor, spp=1024)
+    else:
+        dark = {"type": "irregular", "wavelengths": "300, 809, 810, 1000", "values": "1, 1, 0, 0"}
+        loaded = mi.load_dict(scene(flat, film, dark))
+        parameters = mi.traverse(loaded)
+        parameters["light.radiance.values"] = [1.0] * 4
+        parameters.update()
+        picture = mi.render(loaded, spp=1024)
+    assert np.array(picture).mean() / (film[1] - film[0]) == pytest.approx(1, abs=0.02)
+
+
+def test_a_sensor_of_light_outside_a_table_is_refused(llvm):
+    metal = {**GRATING, "conserve_energy": False, "material": "Al"}
+    sensor = mi.load_dict(scene(metal, (850, 950))["sensor"])
+    with pytest.raises(ValueError, match="material: got light of 850 to 950 nm, and a table of 299 to 885 nm"):
+        mi.render(mi.load_dict(scene(metal)), sensor=sensor, spp=1)
