@@ -9,6 +9,7 @@ from collections.abc import Callable, Sequence
 from typing import Any, NamedTuple, cast
 
 import numpy as np
+import scipy.fft
 from numpy.typing import NDArray
 
 from ..errors import RequestError
@@ -271,19 +272,22 @@ class _Build:
         """Return the amplitude series of a tile, with the requested or required number of terms, and its error."""
         kind, origin = settings.representation, settings.heights_from
         heights = heights - (heights.min() if origin == "lowest" else heights.mean())
-        x = self._max_kappa * float(np.abs(heights).max())
-        count = settings.terms or _terms_needed(kind, heights, self._max_kappa, self._allowed)
+        height = float(np.abs(heights).max())
+        x, u = self._max_kappa * height, heights / (height or 1.0)
+        count = settings.terms or _terms_needed(kind, u, x, self._allowed)
         grid = cast(OrderGrid, self.kept)
         _check_size(grid.shape, 2 * count)
+        terms, report = [], self._phase(0.0, 0.7)
         with stage("powers"):
-            table = AmplitudeTable.build(
-                kind, heights, count, self._max_kappa, lambda a: grid.take(a, 0.5**0.5), self._phase(0.0, 0.7)
-            )
-        self.unresolved_power = max(
-            1 - self._exact.reached(self._exact(kappa)) for kappa in np.linspace(0, self._max_kappa, 12 + int(2 * x))
-        )
+            for n in range(count):
+                transform = scipy.fft.fft2(series_function(kind, n, u), norm="forward")
+                terms.append(grid.take(transform, 0.5**0.5).astype(np.complex64))
+                report(n + 1, count)
+        table = AmplitudeTable(kind, self._max_kappa, height, np.stack(terms))
+        kappas = np.linspace(0, self._max_kappa, 12 + int(2 * x))
+        self.unresolved_power = max(1 - self._exact.reached(self._exact(kappa)) for kappa in kappas)
         with np.errstate(over="ignore", invalid="ignore"):
-            error = self._measured(table, np.linspace(0, self._max_kappa, 12 + int(2 * x)))
+            error = self._measured(table, kappas)
         found = (
             f"{kind}: {count} terms of heights from the {origin}, of a range of {self._range:.3g} µm, err by "
             f"{error:.2g} of the power, more than the tolerance {self._allowed:.2g}"
@@ -313,13 +317,11 @@ class _Build:
         return max_error
 
 
-def _terms_needed(kind: str, heights: NDArray[np.float64], max_kappa: float, allowed: float) -> int:
-    """Return the number of terms that keeps Σ|Δη_m| within the allowed error at κ_max, where the remainder is largest.
+def _terms_needed(kind: str, u: NDArray[np.float64], x: float, allowed: float) -> int:
+    """Return the number of terms that keeps Σ|Δη_m| of e^{ixu}, |u| ≤ 1, within the allowed error.
 
     With ΔF the amplitudes of the remainder, Σ|Δη| ≤ 2‖ΔF‖ + ‖ΔF‖², and ‖ΔF‖² is its mean square over the tile.
     """
-    height = float(np.abs(heights).max())
-    x, u = max_kappa * height, heights / (height or 1.0)
     limit = 40 + int(3 * x)
     weights, remainder = series_weights(kind, limit, x), np.exp(1j * x * u)
     for n in range(limit):

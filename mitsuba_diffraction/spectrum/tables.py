@@ -9,7 +9,6 @@ from functools import cached_property
 from typing import ClassVar
 
 import numpy as np
-import scipy.fft
 import scipy.special
 from numpy.typing import ArrayLike, NDArray
 
@@ -190,24 +189,6 @@ class AmplitudeTable:
         if not (np.isfinite(self.height) and self.height >= 0):
             raise RequestError(f"height: got {self.height}, wanted a length ≥ 0 in µm")
         got.setflags(write=False)
-
-    @classmethod
-    def build(
-        cls,
-        representation: str,
-        heights: NDArray[np.float64],
-        terms: int,
-        max_kappa: float,
-        take: Callable[[NDArray[np.complex128]], NDArray[np.complex128]],
-        progress: Callable[[int, int], None],
-    ) -> AmplitudeTable:
-        """Transform `terms` functions of the heights h, (N_y, N_x) µm; `take` selects the orders of a grid."""
-        height, found = float(np.abs(heights).max()), []
-        for n in range(terms):
-            function = series_function(representation, n, heights / (height or 1.0))
-            found.append(take(scipy.fft.fft2(function, norm="forward")).astype(np.complex64))
-            progress(n + 1, terms)
-        return cls(representation, max_kappa, height, np.stack(found))
 
     @property
     def first_interval(self) -> float:

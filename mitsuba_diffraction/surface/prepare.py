@@ -376,16 +376,21 @@ def _check(name: str, argument: object, where: str = "") -> None:
         raise RequestError(f"{where}{name}: got {argument!r}, wanted {wanted}")
 
 
-def check_steps(steps: object) -> None:
-    """Check a list of steps, each a name or {name: argument}, without a height field."""
+def check_steps(steps: object) -> list[tuple[str, tuple[object, ...]]]:
+    """Check a list of steps, each a name or {name: argument}, and return their names and arguments."""
     if not isinstance(steps, list | tuple):
         raise RequestError(f"prepare: got {steps!r}, wanted a list of steps")
+    found = []
     for step in steps:
-        name, argument = _parts(step)
-        if argument is not None:
+        name, *arguments = next(iter(step.items())) if isinstance(step, Mapping) and len(step) == 1 else [step]
+        if not (isinstance(name, str) and name in _STEPS):
+            raise RequestError(f"prepare: got {step!r}, wanted one of {', '.join(_STEPS)}")
+        for argument in arguments:
             _check(name, argument, "prepare: ")
-        elif name in _ARGUMENT_REQUIRED:
+        if not arguments and name in _ARGUMENT_REQUIRED:
             raise RequestError(f"prepare: {name}: missing its argument, wanted {{ {name} = … }}")
+        found.append((name, tuple(arguments)))
+    return found
 
 
 def apply_steps(height_field: HeightField, steps: Sequence[Step]) -> HeightField:
@@ -394,11 +399,8 @@ def apply_steps(height_field: HeightField, steps: Sequence[Step]) -> HeightField
     Raises:
         ValueError: if a step is invalid or cannot be applied.
     """
-    check_steps(steps)
-    for step in steps:
-        name, argument = _parts(step)
-        function = _STEPS[name][0]
-        height_field = function(height_field) if argument is None else function(height_field, argument)
+    for name, arguments in check_steps(steps):
+        height_field = _STEPS[name][0](height_field, *arguments)
     return height_field
 
 
@@ -411,15 +413,6 @@ def step_of(text: str) -> Step:
         return {name: float(argument)}
     except ValueError:
         return {name: argument}
-
-
-def _parts(step: object) -> tuple[str, object]:
-    name, argument = step, None
-    if isinstance(step, Mapping) and len(step) == 1:
-        ((name, argument),) = step.items()
-    if not (isinstance(name, str) and name in _STEPS):
-        raise RequestError(f"prepare: got {step!r}, wanted one of {', '.join(_STEPS)}")
-    return name, argument
 
 
 def _after(
