@@ -81,12 +81,7 @@ def is_scan(source: str) -> bool:
 
 
 def numbers(option: str, text: str) -> NDArray[np.float64]:
-    """Return the numbers in "30", "0,30,60" or "0:60:5" (60 included), (n,).
-
-    Raises:
-        ValueError: if the text has another form, or more than 10,000 numbers.
-
-    """
+    """Return the numbers in "30", "0,30,60" or "0:60:5" (60 included), (n,), at most 10,000."""
     try:
         if ":" not in text:
             return np.array([float(part) for part in text.split(",")])

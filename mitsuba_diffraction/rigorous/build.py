@@ -84,8 +84,7 @@ def build_spectrum(
 
     Args:
         height_field: the surface; rows that differ are refused.
-        settings: of rigorous theory. The tolerance bounds `RigorousSpectrum.error`, the mean of Σ|Δη_m| / Σ η_m over
-            directions and wavelengths, and a third of `polarisation_error`.
+        settings: of rigorous theory. The tolerance bounds `RigorousSpectrum.error` and a third of `polarisation_error`.
         progress: called with (per cent done, 100) of the work of one table. It begins anew if a finer table is
             needed, which is known only when the error of the first is.
         checkpoints: a folder for intermediate results, from which an interrupted build resumes.

@@ -65,8 +65,7 @@ def _controller() -> ThreadpoolController:
 def one_thread() -> Iterator[None]:
     """Run BLAS on one thread in the block, or in the function that this decorates.
 
-    With matrices of a few hundred rows, threads mostly wait for each other: the spectrum of a tile of 26 × 36 pixels
-    whose lobes overlap took 5 s instead of 0.7 s on two idle cores, and up to thirteen times as long on busy ones.
+    With matrices of a few hundred rows, threads mostly wait for each other: up to thirteen times as long.
     """
     with _controller().limit(limits=1, user_api="blas"):
         yield

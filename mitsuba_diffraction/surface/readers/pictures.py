@@ -49,8 +49,8 @@ def read_npz(path: Path) -> Scan:
             f"pixel_size: got an array of type {pixel_size.dtype} and shape {pixel_size.shape}, "
             "wanted one number or (x, y) in µm"
         )
-    values = tuple(float(value) for value in pixel_size.ravel())
-    return Scan(heights, values if len(values) == 2 else values[0])
+    x, y = np.broadcast_to(pixel_size, 2).tolist()
+    return Scan(heights, (float(x), float(y)))
 
 
 def _load_array(file: IO[bytes]) -> NDArray:

@@ -73,12 +73,12 @@ class Scan:
 
     Attributes:
         numbers: (N_y, N_x); floats are µm, NaN or masked where missing; integers use the full range of their type.
-        pixel_size: µm, one number or (x, y); None if the file has none.
+        pixel_size: (x, y) in µm; None if the file has none.
         channel: the name of the channel, in formats with several.
     """
 
     numbers: NDArray
-    pixel_size: float | tuple[float, float] | None = None
+    pixel_size: tuple[float, float] | None = None
     channel: str = ""
 
 

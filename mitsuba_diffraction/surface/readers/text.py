@@ -128,7 +128,7 @@ def _esri(text: str, unit: str | tuple[str, str] | None) -> Scan:
         )
     if "nodata_value" in header:
         heights = np.where(heights == header["nodata_value"], np.nan, heights)
-    return Scan(heights[::-1] * high, header["cellsize"] * along)
+    return Scan(heights[::-1] * high, 2 * (header["cellsize"] * along,))
 
 
 def _text(path: Path) -> str:
