@@ -219,9 +219,6 @@ class Recipe:
     def _prepared_scan(self, parameters: dict[str, Any]) -> HeightField:
         path = self.folder / parameters.pop("scan")
         steps, fill = parameters.pop("prepare", []), parameters.pop("fill_missing", False)
-        for name in ("pixel_size", "unit"):
-            if isinstance(parameters.get(name), list):
-                parameters[name] = tuple(parameters[name])
         if not steps:
             return read_height_field(path, fill_missing=fill, **parameters)
         scan = read_height_field(path, keep_missing=True, **parameters)

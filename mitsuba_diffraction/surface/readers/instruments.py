@@ -9,7 +9,6 @@ import re
 import warnings
 import zipfile
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -59,26 +58,31 @@ def read(path: Path, unit: str | tuple[str, str] | None, channel: str | int | No
         library = lookup_reader_by_format[name]
         contents = mended.rewritten(path, name)
         try:
-            reader = library(contents)
-            found = list(reader.channels)
-        # Readers of binary files raise arbitrary exceptions.
-        except Exception as error:
-            raise RequestError(f"{_unread(library)} ({_message(error)})") from None
-        chosen = choose(
-            [Channel(c.index, c.name or "untitled", c.dim == 2 and c.data_kind.value == "height") for c in found],
-            channel,
-        )
-        source = found[[c.index for c in found].index(chosen.number)]
-        if 8 * int(np.prod(source.nb_grid_pts, dtype=object)) > MAX_BYTES:
-            raise RequestError(f"got {source.nb_grid_pts} pixels, wanted at most {MAX_BYTES} bytes")
-        given, own = scan.pair(unit), source.unit or ""
-        along, high = (scan.scale(own, one, "its lengths") for one in given)
-        try:
+            found = {c.index: c for c in library(contents).channels}
+            chosen = choose(
+                [
+                    Channel(number, c.name or "untitled", c.dim == 2 and c.data_kind.value == "height")
+                    for number, c in found.items()
+                ],
+                channel,
+            )
+            source = found[chosen.number]
+            if 8 * int(np.prod(source.nb_grid_pts, dtype=object)) > MAX_BYTES:
+                raise RequestError(f"got {source.nb_grid_pts} pixels, wanted at most {MAX_BYTES} bytes")
+            given, own = scan.pair(unit), source.unit or ""
+            along, high = (scan.scale(own, one, "its lengths") for one in given)
             topography = source.topography() if own else source.topography(unit=given[0])
             heights: NDArray[np.float64] = np.ma.asarray(topography.heights(), np.float64).T
             size = topography.physical_sizes
+        except RequestError:
+            raise
+        # Readers of binary files raise arbitrary exceptions; whether the file is damaged, nobody knows.
         except Exception as error:
-            raise RequestError(f"{_unread(library)} ({_message(error)})") from None
+            raise RequestError(
+                f"not read as a file of {library.name()}: it is another one, incomplete, or of a kind that "
+                "SurfaceTopography does not know; if the instrument's program opens it, export it as .gsf, .gwy or "
+                f".sdf ({type(error).__name__}: {error})"
+            ) from None
         if name == "nms":
             heights, factor = mended.nms(path, heights)
             along *= factor
@@ -97,15 +101,3 @@ def _refuse_bomb(path: Path) -> None:
             raise RequestError(f"a damaged archive ({error})") from None
         if unpacked > MAX_BYTES:
             raise RequestError(f"an archive of {unpacked} bytes, wanted at most {MAX_BYTES}")
-
-
-def _unread(library: Any) -> str:
-    """Return what a file is called that the library does not read; whether it is damaged, nobody knows."""
-    return (
-        f"not read as a file of {library.name()}: it is another one, incomplete, or of a kind that SurfaceTopography "
-        "does not know; if the instrument's program opens it, export it as .gsf, .gwy or .sdf"
-    )
-
-
-def _message(error: Exception) -> str:
-    return f"{type(error).__name__}: {error}" if str(error) else type(error).__name__
