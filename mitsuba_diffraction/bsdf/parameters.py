@@ -22,11 +22,13 @@ from ..surface.gratings import PROFILES
 from .base import nested_plugin
 from .coat import SAME_INDEX, Coat, absolute_index, coat_from
 from .fresnel import Conductor, Material, PerfectMirror, reflectance_from
+from .tables import larger
 from .thin_film import with_film
 from .varying import VaryingNumber, check_texture, numbers_from
 
 _PREFIX = "handed over: "
 _MAX_DEGREES = 1e6
+_MIN_HEIGHT_SCALE = 1e-6  # of zero: κ₁, which bounds K of transmitted light, must not vanish; the surface is flat
 _MIN_LATERAL_SCALE = 0.01  # below, a period is shorter than any wavelength
 _handed_over: weakref.WeakValueDictionary[str, Spectrum] = weakref.WeakValueDictionary()
 _SCALAR_ONLY = {
@@ -112,7 +114,7 @@ class Scales:
         Scaling lengths by s and heights by h is equivalent to scaling heights by h/s, at the wavelength λ/s and with
         lobes of the width s σ_q.
         """
-        height = self.height.at(si, active)
+        height = larger(self.height.at(si, active), _MIN_HEIGHT_SCALE)
         if self.lateral is None:
             return height, mi.Float(1.0)
         lateral = self.lateral.at(si, active)
@@ -125,7 +127,8 @@ class Scales:
 
     def ratios(self) -> tuple[float, float]:
         """Return bounds of the ratio of height scale to lateral scale."""
-        (low, high), (min_lateral, max_lateral) = self.height.values[[0, -1]], self.laterals
+        low, high = np.maximum(self.height.values[[0, -1]], _MIN_HEIGHT_SCALE)
+        min_lateral, max_lateral = self.laterals
         return float(low / max_lateral), float(high / min_lateral)
 
     def check(self, wavelengths: tuple[float, float], shortest: float, max_resolved: float | None) -> None:

@@ -75,8 +75,11 @@ def read(path: Path, kind: str, version: int, recipe: str | None) -> tuple[dict[
     # Before OpenEXR reads it: a wrong size in the header could exhaust memory.
     if not is_intact(path):
         raise RequestError(f"{path}: damaged, or another file (its SHA-256 is wrong or missing); {wanted}")
-    file = OpenEXR.File(str(path), separate_channels=True)
-    header, channels = file.header(), file.channels()
+    try:
+        file = OpenEXR.File(str(path), separate_channels=True)
+        header, channels = file.header(), file.channels()
+    except Exception:
+        raise RequestError(f"{path}: no OpenEXR file; {wanted}") from None
     if header.get("format") != kind:
         raise RequestError(f"{path}: an OpenEXR file of another kind; {wanted}")
     if header.get("formatVersion") != version:

@@ -341,6 +341,8 @@ def compact_disc(
         channel_bit: length of a channel bit along the track, µm.
         tracks: number of tracks; times the period, the size of the patch along x.
         length: of the patch along y, µm, at least four pits, rounded to whole channel bits.
+        pixel_size: µm, at most half of the width.
+        seed: of the lengths of pits and lands.
     """
     return draw_tracks(
         "compact disc", EIGHT_TO_FOURTEEN, period, depth, width, channel_bit, tracks, length, pixel_size, seed

@@ -152,7 +152,7 @@ def _refuse(gaps: NDArray[np.bool_]) -> None:
 def as_heights(heights: ArrayLike) -> NDArray[np.float64]:
     """Return heights as an array, (N_y, N_x) µm, NaN where masked; copied only if necessary."""
     try:
-        if np.iscomplexobj(heights):
+        if np.asarray(heights).dtype.kind in "bcSU":
             raise RequestError
         if np.ma.isMaskedArray(heights):
             heights = np.ma.filled(np.ma.asarray(heights, np.float64), np.nan)

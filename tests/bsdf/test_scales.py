@@ -7,6 +7,7 @@ import pytest
 from bsdf_support import (
     PERIOD,
     SURFACES,
+    WAVELENGTHS,
     albedo,
     array,
     bitmap,
@@ -26,6 +27,7 @@ from bsdf_support import (
 )
 
 import mitsuba_diffraction as md
+from mitsuba_diffraction import testing
 
 WI = direction(30, 20)
 TRANSMITS = {"int_ior": 1.5, "transmission": "interface"}
@@ -323,3 +325,25 @@ def test_e_of_very_different_heights_is_that_of_each(llvm, parameters):
             difference = found(both, height, under) - found(alone, height, under)
             assert np.abs(difference.mean()) < 0.01
             assert np.abs(difference).mean() < 0.03
+
+
+@pytest.mark.filterwarnings("ignore:pixels of")
+@pytest.mark.parametrize("scale", ["number", pytest.param("texel", marks=pytest.mark.slow)])
+@pytest.mark.parametrize("surface", ["blazed", pytest.param("xenopeltis", marks=pytest.mark.slow)])
+def test_a_relief_of_no_height_is_a_plane(llvm, surface, scale):
+    """Regression: at a height scale of 0 rounding errors of the table were multiplied by K, up to 1e7."""
+    shape = {"blazed": {"period": PERIOD, "depth": 0.3}, "xenopeltis": {"coherence_length": 10.0, "patches": 1}}
+    grating = {"type": "diffraction_grating", "profile": surface, **shape[surface], "int_ior": 1.5, "ext_ior": 1.0}
+    grating["height_scale"] = steps([0.0, 1.0]) if scale == "texel" else 0.0
+    uv = (0.25, 0.5)
+    for mode, wi, wanted in (
+        ("sheet", direction(30, 20), (1 - mi.fresnel(mi.Float(np.cos(np.pi / 6)), 1.5)[0][0]) ** 2),
+        ("interface", direction(60, 20) * [1, 1, -1], 0.0),  # total reflection
+    ):
+        bsdf = mi.load_dict({**grating, "transmission": mode})
+        wo, weights, _ = testing.sample(bsdf, np.tile(wi, (20_000, 1)), WAVELENGTHS, uv=uv)
+        transmitted = np.where((wo[:, 2] * wi[2] < 0)[:, None], weights, 0).mean()
+        assert transmitted == pytest.approx(wanted, abs=0.01)
+    # Uniform directions find what samples miss.
+    above = random_directions(np.random.default_rng(1), 20_000)
+    assert evaluate(bsdf, wi, above, uv=uv)[0].mean() * 2 * np.pi < 0.05

@@ -83,3 +83,17 @@ def test_what_is_not_read_is_refused_in_one_line(name, tmp_path):
             read_height_field(tmp_path / name)
         assert "\n" not in str(caught.value)
         assert "damaged one" not in str(caught.value)
+
+
+@pytest.mark.parametrize("mark", [" ", ";"])
+def test_whole_numbers_stand_among_those_with_decimal_commas(mark, tmp_path):
+    lines = [
+        mark.join((f"{x}", f"{y}", f"{0.1 * x + 0.2 * y:g}".replace(".", ","))) for y in range(3) for x in range(4)
+    ]
+    (tmp_path / "scan.xyz").write_text("\n".join(lines))
+    field = read_height_field(tmp_path / "scan.xyz", unit="um")
+    assert field.pixel_size == pytest.approx((1, 1))
+    assert np.ptp(field.heights) == pytest.approx(0.7)
+    (tmp_path / "both.xyz").write_text("0 0 1,000\n1 0 1.5\n0 1 2\n1 1 2")
+    with pytest.raises(ValueError, match="not a table of numbers"):
+        read_height_field(tmp_path / "both.xyz", unit="um")

@@ -107,8 +107,19 @@ def test_fill_missing_is_true_or_false(answer):
 
 @pytest.mark.parametrize(
     "heights",
-    [1.0, [1.0, 2.0], np.zeros((2, 2, 2)), np.zeros((0, 3)), np.zeros((3, 0)), [[1j]], [["high"]], [[1, 2], [3]], None],
-    ids=["number", "row", "cube", "no rows", "no columns", "complex", "text", "ragged", "nothing"],
+    [
+        1.0,
+        [1.0, 2.0],
+        np.zeros((2, 2, 2)),
+        np.zeros((0, 3)),
+        np.zeros((3, 0)),
+        [[1j]],
+        [["1"]],
+        [[True]],
+        [[1, 2], [3]],
+        None,
+    ],
+    ids=["number", "row", "cube", "no rows", "no columns", "complex", "text", "truth", "ragged", "nothing"],
 )
 def test_arrays_that_are_not_two_dimensional_heights_are_refused(heights):
     with pytest.raises(ValueError, match="heights: got"):

@@ -25,6 +25,7 @@ from __future__ import annotations
 import io
 import re
 import warnings
+from contextlib import suppress
 from pathlib import Path
 
 import numpy as np
@@ -148,15 +149,19 @@ def _table(text: str) -> NDArray[np.float64]:
     first = next((line for line in text.splitlines() if line.strip() and not line.lstrip().startswith("#")), "")
     if not first:
         raise RequestError("the file holds no numbers")
-    numbers = first.replace(";", " ").split()
+    numbers, point = first.replace(";", " ").split(), str.maketrans(",", ".")
     if len(numbers) > 1 and all(map(_DECIMAL_COMMA.fullmatch, numbers)):
-        text, first = text.replace(",", "."), first.replace(",", ".")
+        text, first = text.translate(point), first.translate(point)
     delimiter = next((mark for mark in (";", ",") if mark in first), None)
     try:
         with warnings.catch_warnings():
             warnings.simplefilter("error")
             return np.loadtxt(io.StringIO(text), dtype=np.float64, comments="#", delimiter=delimiter, ndmin=2)
     except (ValueError, UserWarning) as error:
+        if "," in text and "." not in re.sub("#.*", "", text):
+            # Commas are decimal, but the first line has whole numbers, too.
+            with suppress(RequestError):
+                return _table(text.translate(point))
         raise RequestError(f"not a table of numbers ({error})") from None
 
 
