@@ -142,7 +142,7 @@ def fresnel(cosine: ArrayLike, index: complex) -> tuple[NDArray[np.float64], NDA
         index: n + ik of the material relative to the medium of incidence; ∞ of a perfect mirror. For a real index below
             one, light is totally reflected beyond the critical angle.
     """
-    cosine = np.asarray(cosine, np.float64)
+    cosine = np.maximum(np.asarray(cosine, np.float64), 1e-12)
     if np.isinf(index):
         return np.ones_like(cosine), np.ones_like(cosine)
     square = index**2 - 1 + cosine**2

@@ -189,7 +189,7 @@ def lobe_width(coherence_length: float) -> float:
         ValueError: if the coherence length is not 1 nm to 1 m.
     """
     if not MIN_COHERENCE_LENGTH <= coherence_length <= MAX_COHERENCE_LENGTH:
-        wanted = f"µm, {MIN_COHERENCE_LENGTH:g} to {MAX_COHERENCE_LENGTH:g}"
+        wanted = f"{MIN_COHERENCE_LENGTH:g} to {MAX_COHERENCE_LENGTH:g} µm"
         raise RequestError(f"coherence_length: got {coherence_length!r}, wanted {wanted}")
     return 1 / (2 * math.sqrt(2) * math.pi * (coherence_length / 4))
 

@@ -134,10 +134,11 @@ def refuse_wrong(props: mi.Properties) -> None:
     """
     types = {name: parameter.type for parameter in PARAMETERS for name in parameter.name.split(", ")}
     kinds, objects, profile = mi.Properties.Type, dict(props.objects()), props.get("profile")
+    is_known = isinstance(profile, str) and profile in PROFILES
     nested = {name for name, value in objects.items() if isinstance(value, mi.BSDF)}  # `base_from` names others
     # `surface_from` lists the profiles.
-    known = {*types, *(parameters_of_profile(profile) if profile in PROFILES else ())}
-    if profile in (None, *PROFILES) and (unknown := sorted(set(props.keys()) - known - nested)):
+    known = {*types, *(parameters_of_profile(profile) if is_known else ())}
+    if (profile is None or is_known) and (unknown := sorted(set(props.keys()) - known - nested)):
         raise RequestError(f"{', '.join(unknown)}: unknown, wanted one of {', '.join(sorted(known))}")
     for name in props.keys():  # noqa: SIM118
         kind, wanted = props.type(name), types.get(name, "float or string")

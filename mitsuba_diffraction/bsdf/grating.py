@@ -33,6 +33,7 @@ class Grating:
         theory: the powers of orders, and R, E and other factors.
         coat: over the grating, or None.
         scales, orientation, from_radius: as of `GratingRequest`.
+        light: (shortest, longest) wavelength of the light that was taken, in air, nm; None before there is a scene.
     """
 
     def __init__(self, props: mi.Properties, request: GratingRequest) -> None:
@@ -44,6 +45,7 @@ class Grating:
         self.theory = theory_of(props, self.spectrum, request)
         # Mitsuba's own object does not outlive the construction of the plugin.
         self._props, self._request = mi.Properties(props), request
+        self.light: tuple[float, float] | None = None
         # The grating is black at angles that the spectrum does not cover.
         self.min_cosine = opaque(np.cos(np.deg2rad(self.spectrum.largest_angle)) * (1 - 1e-6))
 
@@ -59,7 +61,7 @@ class Grating:
         return [(low, high) for low, high in parts if high - low > 1e-6 * high]
 
     def cover(self, wavelengths: tuple[float, float]) -> None:
-        """Take the wavelengths of the light in a scene, (shortest, longest) in air, nm.
+        """Take the wavelengths of light, (shortest, longest) in air, nm, beside those taken before.
 
         A spectrum from a recipe or a profile is computed anew where it ends before.
 
@@ -72,6 +74,10 @@ class Grating:
                 f"material: got light of {first:g} to {last:g} nm, and a table of {shortest:g} to {longest:g} nm "
                 f"({self.theory.material}); wanted light inside its range, int_ior, or material=none (R = 1)"
             )
+        before = self.light or wavelengths
+        wavelengths = min(first, before[0]), max(last, before[1])
+        if wavelengths == self.light:
+            return
         try:
             self.theory.cover(wavelengths)
         except RequestError:
@@ -80,7 +86,10 @@ class Grating:
                 raise
             self.recipe, self.spectrum = recipe, recipe.cached(_per_cent)
             self.theory = theory_of(self._props, self.spectrum, self._request)
+            # The parameters are no longer those of the request.
+            self.theory.parameters_changed([])
             self.theory.cover(wavelengths)
+        self.light = wavelengths
 
     def _range(self) -> tuple[float, float]:
         """Return the shortest and the longest wavelength that both spectrum and material cover, nm."""

@@ -34,27 +34,24 @@ def cover_light(scene: mi.Scene, sensor: mi.Sensor | int | None = None) -> None:
 
     Args:
         scene: with its current parameters.
-        sensor: which renders an invisible picture, or its number; default: all sensors of the scene.
+        sensor: that of a picture, or its number; default: all sensors of the scene.
 
     Raises:
         RequestError: if the tables of one cannot; it names the range, and how to widen it.
     """
     if not is_supported(mi.variant()):
         return
+    gratings = {id(bsdf): bsdf for shape in scene.shapes() for bsdf in gratings_in(shape.bsdf())}
     sensors = scene.sensors()
     if sensor is not None:
-        sensors = [sensors[sensor] if isinstance(sensor, int) else sensor]
+        sensors = [sensor] if isinstance(sensor, mi.Sensor) else sensors[sensor : sensor + 1]
+    if not gratings or not sensors:
+        return
     ranges = [wavelengths_of(one.film()) for one in sensors]
-    first, last = min((low for low, _ in ranges), default=0), max((high for _, high in ranges), default=0)
-    if sensor is not None and VISIBLE[0] <= first and last <= VISIBLE[1]:
-        return  # covered since the scene was loaded
-    gratings = {id(bsdf): bsdf for shape in scene.shapes() for bsdf in gratings_in(shape.bsdf())}
-    for bsdf in gratings.values() if sensors else ():
+    first, last = min(low for low, _ in ranges), max(high for _, high in ranges)
+    for bsdf in gratings.values():
         shortest, longest = first, last
-        lacking = bsdf.layers.grating.lacks((first, last))
-        if sensor is not None and not lacking:
-            continue
-        for low, high in lacking:
+        for low, high in bsdf.layers.grating.lacks((first, last)):
             if not any(_emits(emitter, low, high) for emitter in scene.emitters()):
                 shortest, longest = (high, longest) if low == first else (shortest, low)
         if shortest < longest:

@@ -269,7 +269,7 @@ class OrderSpectrum:
         resolved: whether at most one order contributes at q, and an order is drawn instead of q.
         power: η_m(κ).
         per_width: 1/σ_q.
-        sampler: that of overlapping orders, or else of a scene.
+        sampler: of overlapping orders; resolved ones have it from `drawn_by`.
     """
 
     sampler: OrderSampler | BinSampler

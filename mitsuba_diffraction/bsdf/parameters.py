@@ -28,7 +28,7 @@ from .varying import VaryingNumber, check_texture, numbers_from
 
 _PREFIX = "handed over: "
 _MAX_DEGREES = 1e6
-_MIN_HEIGHT_SCALE = 1e-6  # of zero: κ₁, which bounds K of transmitted light, must not vanish; the surface is flat
+_MIN_HEIGHT_SCALE = 1e-6  # stands for 0, where κ₁, which bounds K of transmitted light, would vanish
 _MIN_LATERAL_SCALE = 0.01  # below, a period is shorter than any wavelength
 _handed_over: weakref.WeakValueDictionary[str, Spectrum] = weakref.WeakValueDictionary()
 _SCALAR_ONLY = {

@@ -6,6 +6,7 @@ import itertools
 import math
 from collections.abc import Iterator
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import drjit as dr
 import mitsuba as mi
@@ -47,6 +48,22 @@ class _Pair:
     inside: mi.Float
     z: mi.Float
     above: tuple[mi.Bool, mi.Bool] | None
+
+
+class _Position(NamedTuple):
+    """The coordinates of an order of a pair in the table.
+
+    Attributes:
+        row: of the table.
+        nodes: of F, X and Z: the grid cell, and the coordinate in it.
+        is_reversed: whether the table holds the reverse of the pair.
+        active: whether the order propagates.
+    """
+
+    row: mi.UInt32
+    nodes: list[tuple[mi.UInt32, mi.Float]]
+    is_reversed: mi.Bool
+    active: mi.Bool
 
 
 class RigorousOrders:
@@ -199,7 +216,8 @@ class RigorousOrders:
 
     def _efficiency(self, m: mi.Int32, pair: _Pair, active: mi.Bool) -> mi.Float:
         """Return η_m, linear between the nodes; 0 for an evanescent order."""
-        row, ((i, f), (j, h), (k, w)), _, active = self._position(m, pair, active)
+        at = self._position(m, pair, active)
+        row, active, ((i, f), (j, h), (k, w)) = at.row, at.active, at.nodes
         f_steps, x_steps, z_steps = self.axes.steps
         packet = self.table(((row * f_steps + i) * x_steps + j) * z_steps + k, active)
         # Along Z between the lower and the upper half of each word, then along X and F.
@@ -207,14 +225,8 @@ class RigorousOrders:
         found = dr.lerp(dr.lerp(along_z[0], along_z[1], h), dr.lerp(along_z[2], along_z[3], h), f)
         return dr.select(active, found * (1 / MAX_STORED), 0)
 
-    def _position(
-        self, m: mi.Int32, pair: _Pair, active: mi.Bool
-    ) -> tuple[mi.UInt32, list[tuple[mi.UInt32, mi.Float]], mi.Bool, mi.Bool]:
-        """Return the coordinates of order m in the table.
-
-        They are the row; of F, X and Z the grid cell and the coordinate in it; whether the table holds the reverse of
-        the pair; and whether the order propagates.
-        """
+    def _position(self, m: mi.Int32, pair: _Pair, active: mi.Bool) -> _Position:
+        """Return the coordinates of order m of a pair in the table."""
         k_x = pair.half.x + 0.5 * mi.Float(m)
         whole = dr.round(k_x)
         n, a = mi.Int32(whole), dr.abs(k_x - whole)
@@ -249,7 +261,7 @@ class RigorousOrders:
             active &= channel < channels_of_side
             channels.append(channel + first)
         row = dr.select(active, start + channels[0] * count + channels[1], 0)
-        return row, nodes, is_reversed, active
+        return _Position(row, nodes, is_reversed, active)
 
     def _bin(self, incidence: Incidence) -> mi.Int32:
         """Return the index of order 0 in the bin of the sampler."""

@@ -181,7 +181,6 @@ class ScalarTheory(Theory):
                 f"{got}, and a spectrum for wavelengths from {self.spectrum.wavelengths[0]:g} nm{why}: build it from "
                 f"{shortest:.4g} nm"
             )
-        self.light = light
         # The longest wavelength grows as the index falls.
         self.spectrum = self.spectrum.up_to(last / index)
         self.tables = SharedTables.of(self.spectrum, self.media.eta)
@@ -192,7 +191,7 @@ class ScalarTheory(Theory):
             self.energy = self.tables.energy(scales)
         self.interface = self._interface()
         shortest, longest = self.spectrum.wavelengths
-        self.wavelengths = shortest * index, longest * index
+        self.wavelengths, self.light = (shortest * index, longest * index), light
 
     def _interface(self) -> Interface:
         """Return the media above and below, and set the sampler of orders for the current scales and index."""

@@ -97,8 +97,8 @@ def read_target(path: Path) -> NDArray[np.float64]:
             has_alpha = image.mode.endswith("A") and image.getextrema()[-1] != (255, 255)
             if has_alpha or "transparency" in image.info:
                 raise RequestError(f"{path}: got a picture with alpha, wanted an opaque one")
-            # Older versions of Pillow open PNG files of 16 bits as 32 bit integers.
-            if image.mode == "F" or (image.mode == "I" and opened.format != "PNG"):
+            # Pillow opens PGM files of 16 bits, and older versions PNG files, as integers of 32 bits.
+            if image.mode == "F" or (image.mode == "I" and opened.format not in ("PNG", "PPM")):
                 raise RequestError(f"{path}: got numbers of 32 bits, wanted a picture of 8 or 16 bits per channel")
             if image.mode.startswith("I"):
                 encoded = np.asarray(image, np.float64) / 65535

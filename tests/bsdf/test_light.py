@@ -122,3 +122,55 @@ def test_a_sensor_of_light_outside_a_table_is_refused(llvm):
     sensor = mi.load_dict(scene(metal, (850, 950))["sensor"])
     with pytest.raises(ValueError, match="material: got light of 850 to 950 nm, and a table of 299 to 885 nm"):
         mi.render(mi.load_dict(scene(metal)), sensor=sensor, spp=1)
+
+
+def test_a_picture_in_infrared_leaves_the_scene_as_it_was(llvm):
+    # Regression: its light replaced that of the scene, so that scales for which there is no table were accepted.
+    loaded = mi.load_dict(scene({"type": "diffraction_grating", "spectrum": spectrum(360, 830), "material": "none"}))
+    mi.render(loaded, sensor=mi.load_dict(scene(GRATING, (850, 950))["sensor"]), spp=1)
+    parameters = mi.traverse(loaded)
+    parameters["grating.bsdf.height_scale"] = 2.0
+    with pytest.raises(ValueError, match="height_scale: got 2, wanted 0 to 1"):
+        parameters.update()
+
+
+def test_a_refused_sensor_leaves_the_scene_as_it_was(llvm):
+    of = md.precompute(md.gratings.sinusoidal(2.5, 0.25), wavelengths=(300, 830), coherence_length=4.0)
+    grating = {"type": "diffraction_grating", "spectrum": of, "material": "none", "conserve_energy": False}
+    loaded = mi.load_dict(scene({**grating, "height_scale": 1.2}))
+    with pytest.raises(ValueError, match=r"height_scale: got 1\.2, wanted 0 to 1\.033"):
+        mi.render(loaded, sensor=mi.load_dict(scene(grating, (310, 355))["sensor"]), spp=1)
+    parameters = mi.traverse(loaded)
+    parameters["grating.bsdf.height_scale"] = 1.1
+    parameters.update()
+
+
+@pytest.mark.slow
+def test_a_spectrum_for_ultraviolet_has_the_current_index(llvm):
+    # Regression: the tables were made for the index of the scene at loading.
+    glass = {**GRATING, "transmission": "interface", "int_ior": 1.5}
+    loaded, fresh = (mi.load_dict(scene({**glass, "int_ior": n})) for n in (1.5, 1.2))
+    parameters = mi.traverse(loaded)
+    parameters["grating.bsdf.eta"] = parameters["grating.bsdf.eta"] * (1.2 / 1.5)
+    parameters.update()
+    sensor = mi.load_dict(scene(glass, (250, 300))["sensor"])
+    for one in (loaded, fresh):
+        mi.render(one, sensor=sensor, spp=1)
+    found, wanted = (albedo(one.shapes()[0].bsdf(), direction(60, 20) * [1, 1, -1]) for one in (loaded, fresh))
+    np.testing.assert_allclose(found, wanted, rtol=0.05)
+
+
+def test_visible_light_outside_a_saved_spectrum_is_refused_once_it_is_there(llvm):
+    line = {"type": "irregular", "wavelengths": "360, 529, 530, 540, 541, 830", "values": "0, 0, 1, 1, 0, 0"}
+    loaded = mi.load_dict(scene({"type": "diffraction_grating", "spectrum": spectrum(500, 600)}, light=line))
+    mi.render(loaded, spp=1)
+    parameters = mi.traverse(loaded)
+    parameters["light.radiance.values"] = [1.0] * 6
+    parameters.update()
+    with pytest.raises(ValueError, match="light from 360 nm"):
+        mi.render(loaded, spp=1)
+
+
+def test_a_scene_without_a_sensor_is_refused_by_mitsuba(llvm):
+    with pytest.raises(Exception, match="No sensor specified"):
+        mi.render(mi.load_dict({"type": "scene", "integrator": {"type": "path"}, "shape": {"type": "sphere"}}))

@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 from bsdf_support import of_spectrum, plugin, spectrum
 
-GRATING = "filename representation theory int_ior material orientation height_scale shadowing coat_ior base"
+GRATING = "filename profile representation theory int_ior material orientation height_scale shadowing coat_ior base"
 OTHERS = {
     "color": {"type": "rgb", "value": [0.1, 0.2, 0.3]},
     "spectrum": {"type": "spectrum", "value": [(400, 1), (700, 2)]},

@@ -67,6 +67,12 @@ def test_a_target_is_upright_as_its_exif_data_say():
     assert not np.array_equal(np.rot90(upright, -1), upright)
 
 
+def test_a_target_may_be_a_pgm_of_16_bits():
+    levels = np.linspace(0, 65535, 8).astype(">u2").reshape(1, 8).repeat(8, 0)
+    Path("grey.pgm").write_bytes(b"P5 8 8 65535\n" + levels.tobytes())
+    assert read_target(Path("grey.pgm"))[0, [0, 7]] == pytest.approx([0, 1])
+
+
 @pytest.mark.parametrize("kind", [np.float32, np.int32])
 def test_a_target_of_32_bits_is_refused(kind):
     levels = np.linspace(0, 1, 8).reshape(1, 8).repeat(8, 0)

@@ -235,7 +235,7 @@ def test_a_picture_is_refused(tmp_path):
     path = tmp_path / "picture.exr"
     header = {"compression": OpenEXR.ZIP_COMPRESSION, "type": OpenEXR.scanlineimage}
     OpenEXR.File(header, {"RGB": np.zeros((4, 4, 3), np.float32)}).write(str(path))
-    assert "wanted a grating spectrum" in refusal(path)
+    assert "its SHA-256 is wrong or missing" in refusal(path)
 
 
 def grid_entry(spectrum):
@@ -355,7 +355,7 @@ def test_a_spectrum_without_its_digest_is_refused(saved):
 def test_text_is_refused(tmp_path):
     path = tmp_path / "text.exr"
     path.write_text("not a picture")
-    assert "wanted a grating spectrum" in refusal(path)
+    assert "its SHA-256 is wrong or missing" in refusal(path)
 
 
 def test_a_folder_and_nothing_are_refused(tmp_path):

@@ -97,3 +97,10 @@ def test_whole_numbers_stand_among_those_with_decimal_commas(mark, tmp_path):
     (tmp_path / "both.xyz").write_text("0 0 1,000\n1 0 1.5\n0 1 2\n1 1 2")
     with pytest.raises(ValueError, match="not a table of numbers"):
         read_height_field(tmp_path / "both.xyz", unit="um")
+
+
+@pytest.mark.parametrize("text", ["1,2\n3,4\n5\n", "1,2\n3,\n5,6\n"])
+def test_damaged_lines_with_commas_are_no_decimals(text, tmp_path):
+    (tmp_path / "scan.asc").write_text(text)
+    with pytest.raises(ValueError, match="not a table of numbers"):
+        read_height_field(tmp_path / "scan.asc", unit="um", pixel_size=1.0)

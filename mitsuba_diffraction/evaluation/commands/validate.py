@@ -82,8 +82,6 @@ def validate(
 
 
 def _recipe(path: Path, of_scan: dict[str, object], settings: dict[str, object]) -> Recipe:
-    if path.suffix.lower() != ".toml":
-        settings = {"extent": "sample", **settings}
     recipe = recipe_of(path, of_scan, settings)
     if recipe.patches > 1:
         recipe = replace(recipe, surface={**recipe.surface, "patches": 1})

@@ -151,7 +151,8 @@ def compare(
             raise RequestError(f"{name}: got {settings[name]!r}, which {', '.join((shader, *others))} cannot use")
     open_scene = functools.partial(
         Pictures,
-        *(scene_path, shader),
+        scene_path,
+        shader,
         seed=seed,
         parameters=parameters,
         settings=settings,

@@ -16,7 +16,7 @@ class Quirks:
 
     Attributes:
         schlick: Schlick's approximation (eq. B.1), at 60° a fifth too low for an index of 1.5; corrected: the Fresnel
-            reflectance of a dielectric. of a conductor Schlick's as well.
+            reflectance of a dielectric; a conductor keeps Schlick's.
         fixed_index: F is that of an index of 1.5 for any material; corrected: R at normal incidence of the material.
         complex_window_sum: |Σ φ F|² without the spatial average ⟨·⟩; corrected: Σ φ² |F|².
         one_texel: the neighbourhood is one texel on each side (section 4.4.1); corrected: as many as

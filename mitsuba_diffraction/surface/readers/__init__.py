@@ -191,7 +191,7 @@ def _in_unit(read: Scan, unit: str | tuple[str, str], extension: str) -> Scan:
     if read.numbers.dtype.kind != "f":
         raise RequestError(f"unit: got {unit!r} for integers in {extension}, wanted height_range, in µm")
     along, high = (micrometres(name, "unit") for name in pair(unit))
-    size = read.pixel_size and (along * read.pixel_size[0], along * read.pixel_size[1])
+    size = None if read.pixel_size is None else (along * read.pixel_size[0], along * read.pixel_size[1])
     return replace(read, numbers=read.numbers * high, pixel_size=size)
 
 

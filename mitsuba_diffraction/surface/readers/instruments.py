@@ -81,7 +81,7 @@ def read(path: Path, unit: str | tuple[str, str] | None, channel: str | int | No
             raise RequestError(
                 f"not read as a file of {library.name()}: it is another one, incomplete, or of a kind that "
                 "SurfaceTopography does not know; if the instrument's program opens it, export it as .gsf, .gwy or "
-                f".sdf ({type(error).__name__}: {error})"
+                f".sdf ({type(error).__name__}{f': {error}' if str(error) else ''})"
             ) from None
         if name == "nms":
             heights, factor = mended.nms(path, heights)

@@ -158,7 +158,7 @@ def _table(text: str) -> NDArray[np.float64]:
             warnings.simplefilter("error")
             return np.loadtxt(io.StringIO(text), dtype=np.float64, comments="#", delimiter=delimiter, ndmin=2)
     except (ValueError, UserWarning) as error:
-        if "," in text and "." not in re.sub("#.*", "", text):
+        if len(numbers) > 1 and "," in text and "." not in re.sub("#.*", "", text):
             # Commas are decimal, but the first line has whole numbers, too.
             with suppress(RequestError):
                 return _table(text.translate(point))
