@@ -33,7 +33,6 @@ class Grating:
         theory: the powers of orders, and R, E and other factors.
         coat: over the grating, or None.
         scales, orientation, from_radius: as of `GratingRequest`.
-        light: (shortest, longest) wavelength of the light that was taken, in air, nm; None before there is a scene.
     """
 
     def __init__(self, props: mi.Properties, request: GratingRequest) -> None:
@@ -45,7 +44,6 @@ class Grating:
         self.theory = theory_of(props, self.spectrum, request)
         # Mitsuba's own object does not outlive the construction of the plugin.
         self._props, self._request = mi.Properties(props), request
-        self.light: tuple[float, float] | None = None
         # The grating is black at angles that the spectrum does not cover.
         self.min_cosine = opaque(np.cos(np.deg2rad(self.spectrum.largest_angle)) * (1 - 1e-6))
 
@@ -74,9 +72,9 @@ class Grating:
                 f"material: got light of {first:g} to {last:g} nm, and a table of {shortest:g} to {longest:g} nm "
                 f"({self.theory.material}); wanted light inside its range, int_ior, or material=none (R = 1)"
             )
-        before = self.light or wavelengths
+        before = self.theory.light or wavelengths
         wavelengths = min(first, before[0]), max(last, before[1])
-        if wavelengths == self.light:
+        if wavelengths == self.theory.light:
             return
         try:
             self.theory.cover(wavelengths)
@@ -89,7 +87,6 @@ class Grating:
             # The parameters are no longer those of the request.
             self.theory.parameters_changed([])
             self.theory.cover(wavelengths)
-        self.light = wavelengths
 
     def _range(self) -> tuple[float, float]:
         """Return the shortest and the longest wavelength that both spectrum and material cover, nm."""

@@ -74,6 +74,7 @@ class Theory(Protocol):
         media: those around the grating.
         shadowing: whether G is a factor.
         wavelengths: (shortest, longest) of the table, in air, nm.
+        light: (shortest, longest) of the light that was taken by `cover`, in air, nm; None before there is a scene.
     """
 
     scattering: Scattering
@@ -82,6 +83,7 @@ class Theory(Protocol):
     media: Media
     shadowing: bool
     wavelengths: tuple[float, float]
+    light: tuple[float, float] | None = None
 
     def cover(self, wavelengths: tuple[float, float]) -> None:
         """Take the wavelengths of the light in a scene, (shortest, longest) in air, nm.
@@ -154,7 +156,6 @@ class ScalarTheory(Theory):
         self.spectrum, self.media, self.scales = spectrum, request.media, request.scales
         self.material, self.shadowing = request.material, request.shadowing
         self.conserve_energy = request.conserve_energy
-        self.light: tuple[float, float] | None = None
         self.update()
 
     def cover(self, wavelengths: tuple[float, float]) -> None:
@@ -303,6 +304,7 @@ class RigorousTheory(Theory):
                 f"wavelengths: got light of {first:g} to {last:g} nm and a rigorous spectrum of {shortest:g} to "
                 f"{longest:g} nm: build it for wavelengths=({first:g}, {last:g})"
             )
+        self.light = wavelengths
 
     def evaluate(
         self, geometry: Geometry, incidence: Incidence, pair: tuple[Coordinates, Coordinates] | None, active: mi.Bool

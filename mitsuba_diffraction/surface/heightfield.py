@@ -151,17 +151,17 @@ def _refuse(gaps: NDArray[np.bool_]) -> None:
 
 def as_heights(heights: ArrayLike) -> NDArray[np.float64]:
     """Return heights as an array, (N_y, N_x) µm, NaN where masked; copied only if necessary."""
+    got = type(heights).__name__
     try:
-        if (kind := np.asarray(heights).dtype).kind in "bcSU":
-            raise TypeError(f" of type {kind}")
+        kind = np.asarray(heights).dtype
+        got += f" of type {kind}"
+        if kind.kind in "bcSU":
+            raise TypeError
         if np.ma.isMaskedArray(heights):
             heights = np.ma.filled(np.ma.asarray(heights, np.float64), np.nan)
         array = np.asarray(heights, dtype=np.float64)
-    except (TypeError, ValueError) as error:
-        reason = str(error) if str(error).startswith(" of type") else ""
-        raise RequestError(
-            f"heights: got {type(heights).__name__}{reason}, wanted a two-dimensional array of real heights in µm"
-        ) from None
+    except (TypeError, ValueError):
+        raise RequestError(f"heights: got {got}, wanted a two-dimensional array of real heights in µm") from None
     if array.ndim != 2 or array.size == 0:
         raise RequestError(f"heights: got an array of shape {array.shape}, wanted (rows, columns), at least (1, 1)")
     return array
