@@ -147,7 +147,7 @@ class OrderSampler:
         self, furnaces: Sequence[Furnace], above: bool, reflects: bool, slice_: float
     ) -> NDArray[np.floating]:
         """Return p_m² at the nodes of directions, averaged over scales of heights: (rows, columns, orders, orders)."""
-        (inside, outside), outgoing_below = self._indices(above), above != reflects
+        (inside, outside), (relief, outgoing) = self._indices(above), self._indices(above == reflects)
         omega, wavelengths = self._nodes(slice_)
         result = np.zeros((len(omega), *(2 * self.max_order[::-1] + 1)), np.float32)
         for furnace in furnaces:
@@ -155,12 +155,11 @@ class OrderSampler:
             for way in furnace.branches[:1] if reflects else furnace.branches[1:]:
                 node, component, power = furnace.terms(self._inside(omega, above), wavelengths / inside, way)
                 m = np.rint((way or 1) * furnace.q[component] * self.tile).astype(np.int64)
-                if self.is_sheet:
-                    tangent = outside * omega[node, :2] + wavelengths[node, None] * m / self.tile
-                    square = 1 - (tangent**2).sum(-1)
-                    power = power * (square > 0)
-                    if outgoing_below:
-                        power *= 1 - np.mean(fresnel(np.sqrt(np.maximum(square, 0)), self.eta), axis=0)
+                tangent = outside * omega[node, :2] + wavelengths[node, None] * m / self.tile
+                square = outgoing**2 - (tangent**2).sum(-1)
+                power = power * (square > 0)
+                if relief != outgoing:
+                    power *= 1 - np.mean(fresnel(np.sqrt(np.maximum(square, 0)) / outgoing, relief / outgoing), axis=0)
                 column, row = (m + self.max_order).T
                 powers[node, row, column] += power
             result += powers**2 / len(furnaces)
@@ -244,7 +243,7 @@ def _packed_cumulative(
     """Return the cumulative sums of P over the rectangles of all bins, concatenated, and the start of each.
 
     Args:
-        p: proportional to P_m, (bins, orders, orders); zero outside of the rectangles.
+        p: proportional to P_m in the rectangles, (bins, orders, orders).
         first: first column and row of the rectangles, (bins, 2).
         size: their numbers of columns and rows, (bins, 2).
     """
@@ -261,9 +260,10 @@ def _packed_cumulative(
 def cumulative_units(p: NDArray[np.float64], possible: NDArray[np.bool_]) -> NDArray[np.float64]:
     """Return cumulative sums of P_m in units of 2⁻²⁴, of which float32 has exact differences, beginning with zero.
 
-    P_m is proportional to `p`, but for `UNIFORM_FRACTION`, which is divided equally among the `possible` orders:
-    (..., orders) → (..., orders + 1).
+    P_m is proportional to `p` among the `possible` orders, but for `UNIFORM_FRACTION`, which is divided equally among
+    them, and zero elsewhere: (..., orders) → (..., orders + 1).
     """
+    p = p * possible
     p = (1 - UNIFORM_FRACTION) * p / np.maximum(p.sum(axis=-1, keepdims=True), 1e-30)
     p += UNIFORM_FRACTION * possible / possible.sum(axis=-1, keepdims=True)
     sums = np.rint(PROBABILITY_UNITS * p.cumsum(axis=-1) / p.sum(axis=-1, keepdims=True))

@@ -99,6 +99,37 @@ def test_the_front_face_follows_fresnel_and_no_light_is_gained(llvm, theta, turn
     assert front < albedo < 1 + 4 * weight[:, 0].std() / np.sqrt(len(weight))
 
 
+def test_samples_of_resolved_orders_average_to_the_integral_on_a_grid(llvm):
+    """Orders beyond the critical angle of the coat, most of the power of these gratings, are not drawn.
+
+    The integrals are over a grid of directions about each order, which is drawn from nothing: with directions from the
+    sampler, a wrong density would cancel.
+    """
+    wavelength, count = 0.55, 1 << 15
+    context = mi.BSDFContext()
+    context.type_mask = +mi.BSDFFlags.GlossyReflection
+    for profile, theta in (("sinusoidal", 45.0), ("ruled", 45.0), ("ruled", 80.0)):
+        period, depth = (2.5, 0.3) if profile == "sinusoidal" else (1 / 1.2, 0.3)
+        surface = {"profile": "sinusoidal" if profile == "sinusoidal" else "blazed", "period": period, "depth": depth}
+        bsdf = mi.load_dict({"type": "diffraction_grating", **surface, "material": "Al", "coat_ior": 1.5})
+        wi, sigma = direction(theta), bsdf.spectrum.lobe_width
+        offsets = np.linspace(-6, 6, 61) * sigma
+        m = np.arange(-12, 13)
+        q = np.stack(np.broadcast_arrays(m[:, None, None] / period + offsets[:, None], offsets), -1).reshape(-1, 2)
+        wo = testing.towards(wi, q, 1e3 * wavelength)
+        wo = wo[np.isfinite(wo).all(-1) & (wo[:, 2] > 1e-3)]
+        area = (wavelength * (offsets[1] - offsets[0])) ** 2
+        value, pdf = (
+            (found[:, 0] / wo[:, 2]).sum() * area
+            for found in testing.evaluate_pdf(bsdf, wi, wo, [1e3 * wavelength] * 4, context)
+        )
+        _, weight, bs = testing.sample(bsdf, np.broadcast_to(wi, (count, 3)), [1e3 * wavelength] * 4, context=context)
+        drawn, weight = np.array(bs.pdf) > 0, weight[:, 0]
+        # The defensive lobe is outside of the grid.
+        np.testing.assert_allclose(pdf, drawn.mean(), atol=0.025)
+        np.testing.assert_allclose(weight.mean(), value, rtol=0.02, atol=4 * weight.std() / np.sqrt(count))
+
+
 @pytest.mark.parametrize("theta", [0, 60])
 def test_samples_pass_the_chi_square_test(llvm, theta):
     context = mi.BSDFContext()
