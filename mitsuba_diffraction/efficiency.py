@@ -14,9 +14,9 @@ from numpy.typing import ArrayLike, NDArray
 from . import rigorous
 from .errors import RequestError, is_number
 from .files import whole_file
+from .materials import RefractiveIndex, index_of, refractive_index
 from .outputs import MARK, METADATA
 from .progress import Progress, silent
-from .rigorous import refractive_index
 from .rigorous.coordinate_transformation import curve_of, is_profile
 from .rigorous.efficiencies import sheet_orders
 from .scalar_theory import incident_direction, profile_powers, scalar_orders, tile_powers, transmitted_orders
@@ -187,7 +187,7 @@ def efficiencies(
     *,
     theory: str = "scalar",
     material: str | None = None,
-    int_ior: complex | None = None,
+    int_ior: complex | str | None = None,
     transmission: str = "none",
     azimuth: float = 0.0,
     progress: Progress = silent,
@@ -208,8 +208,9 @@ def efficiencies(
         angles: of incidence, degrees, one or (a,), above −90 and below 90.
         wavelengths: nm, in vacuum, one or (w,).
         theory: "scalar" or "rigorous".
-        material: a conductor by Mitsuba's name, "Al"; or "none", the perfect mirror R = 1, in scalar theory.
-        int_ior: or an index of refraction, or n + ik; 1.5 if neither is given, as in a scene.
+        material: a conductor by Mitsuba's name, "Al", or a file; or "none", the perfect mirror R = 1, in scalar theory.
+        int_ior: or an index of refraction, n + ik, the name of a medium with dispersion, "BK7", or a file
+            (`materials.index_of`); 1.5 if neither is given, as in a scene.
         transmission: "none": reflected orders; "interface": orders transmitted into the dielectric; "sheet": orders
             transmitted by a film with a flat lower face, n_o = 1, in rigorous theory with all internal reflections.
         azimuth: of the plane of incidence, degrees from the x axis; 90: along the grooves (conical incidence).
@@ -233,13 +234,14 @@ def efficiencies(
     int_ior = 1.5 if material is None and int_ior is None else int_ior
     if transmission not in TRANSMISSIONS:
         raise RequestError(f"transmission: got {transmission!r}, wanted one of {', '.join(TRANSMISSIONS)}")
-    if transmission != "none" and (material is not None or np.imag(int_ior or 1)):
+    medium = None if int_ior is None else index_of("int_ior", int_ior)
+    if transmission != "none" and (medium is None or medium.absorbs):
         absorbing = f"material {material!r}" if material is not None else f"int_ior {int_ior}"
         raise RequestError(f"transmission: got {transmission!r} with {absorbing}, wanted a dielectric: int_ior, real")
     if profile := is_profile(height_field):
         height_field = HeightField(height_field.heights[:1], height_field.pixel_size, height_field.source)
     # The largest |q| is (n_i + n_o)/λ.
-    shortest = wavelengths.min() * 1e-3 * (1.0 if transmission == "none" else 2 / (1 + max(np.real(int_ior or 1), 1)))
+    shortest = wavelengths.min() * 1e-3 * (1.0 if transmission == "none" else 2 / (1 + max(_largest(medium), 1)))
     solve = (_scalar if theory == "scalar" else _rigorous)(height_field, azimuth, shortest, transmission)
     found: dict[tuple[int, ...], Array] = {}
     for step, (a, w) in enumerate(np.ndindex(len(angles), len(wavelengths)), 1):
@@ -259,16 +261,20 @@ def efficiencies(
     )
 
 
+def _largest(medium: RefractiveIndex | None) -> float:
+    return 1.0 if medium is None else float(medium.values.real.max())
+
+
 def description(
     source: str,
     material: str | None,
-    int_ior: complex | None,
+    int_ior: complex | str | None,
     azimuth: float,
     theory: str = "scalar",
     transmission: str = "none",
 ) -> str:
     """Return the description of a surface, material and theory, from arguments of `efficiencies`."""
-    what = material if material is not None else f"n = {int_ior:g}"
+    what = material if material is not None else f"n = {int_ior if isinstance(int_ior, str) else f'{int_ior:g}'}"
     plane = f", plane of incidence at {azimuth:g}°" if azimuth else ""
     transmitted = {"none": "", "interface": ", transmitted orders inside", "sheet": ", transmitted by a sheet"}[
         transmission
@@ -276,7 +282,7 @@ def description(
     return f"{source}; {what}, {theory} theory{transmitted}{plane}"
 
 
-def index_at(wavelength: float, material: str | None, int_ior: complex | None, theory: str = "scalar") -> complex:
+def index_at(wavelength: float, material: str | None, int_ior: complex | str | None, theory: str = "scalar") -> complex:
     """Return n + ik at a wavelength in µm; in scalar theory infinite for material "none", the perfect mirror."""
     if (theory, material, int_ior) == ("scalar", "none", None):
         return complex("inf")

@@ -61,7 +61,7 @@ def peak_efficiencies(
     wavelengths: ArrayLike,
     *,
     material: str | None = None,
-    int_ior: complex | None = None,
+    int_ior: complex | str | None = None,
     azimuth: float = 0.0,
     progress: Progress = silent,
 ) -> PeakEfficiencies:
@@ -110,7 +110,11 @@ def peak_efficiencies(
 
 
 def check_request(
-    valid: tuple[float, float], angles: ArrayLike, wavelengths: ArrayLike, material: str | None, int_ior: complex | None
+    valid: tuple[float, float],
+    angles: ArrayLike,
+    wavelengths: ArrayLike,
+    material: str | None,
+    int_ior: complex | str | None,
 ) -> tuple[Array, Array]:
     """Return angles (a,) and wavelengths (w,) if the arguments of `peak_efficiencies` are right.
 

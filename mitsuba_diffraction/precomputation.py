@@ -38,7 +38,7 @@ def precompute(
     heights_from: str = "mean",
     progress: Progress = silent,
     theory: str = "scalar",
-    int_ior: complex | None = None,
+    int_ior: complex | str | None = None,
     material: str | None = None,
     ext_ior: float = 1.0,
     polarised: bool = False,

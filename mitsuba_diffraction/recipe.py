@@ -49,6 +49,7 @@ from typing import Any
 from .errors import RequestError, check_whole
 from .files import cache_folder, refuse_special
 from .grating_spectrum import FORMAT_VERSION, GratingSpectrum
+from .materials import is_file
 from .precomputation import Spectrum, build_spectrum, load_spectrum
 from .progress import Progress, no_progress, part, silent, stage
 from .rigorous import build as rigorous
@@ -166,7 +167,9 @@ class Recipe:
             surface, spectrum = content.get("surface", {}), content.get("spectrum", {})
             if not (isinstance(surface, dict) and isinstance(spectrum, dict)):
                 raise RequestError("wanted the tables [surface] and [spectrum]")
-            spectrum = {**spectrum, **settings}
+            # Files of indices are named relative to the recipe.
+            of_files = {name for name in ("material", "int_ior") if is_file(spectrum.get(name))}
+            spectrum = {**spectrum, **{name: str(path.parent / spectrum[name]) for name in of_files}, **settings}
             _refuse_unknown("[spectrum]", spectrum, _SPECTRUM_KEYS)
             _refuse_other_values(spectrum)
             return cls(surface, Settings(**spectrum), path.parent)
@@ -176,8 +179,9 @@ class Recipe:
 
     @property
     def files(self) -> list[Path]:
-        """The files that the recipe names: its scan, or none."""
-        return [self.folder / self.surface["scan"]] if "scan" in self.surface else []
+        """The files that the recipe names: its scan and that of an index, if there are any."""
+        scans = [self.folder / self.surface["scan"]] if "scan" in self.surface else []
+        return scans + ([Path(str(self.settings.material))] if is_file(self.settings.material) else [])
 
     @property
     def patches(self) -> int:

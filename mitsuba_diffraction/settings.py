@@ -54,8 +54,8 @@ class Settings:
         terms: N of a series, whatever its error; None, in files "auto", is the number that the tolerance requires.
         heights_from: the level of h = 0 in a series: "mean" or "lowest".
         theory: "scalar", or "rigorous": Maxwell's equations, for a tile of one row and one material only.
-        int_ior: in rigorous theory, index of refraction of a dielectric, or n + ik.
-        material: or a conductor by Mitsuba's name.
+        int_ior: in rigorous theory, index of a dielectric, or n + ik; a name or a file is kept as material.
+        material: or a conductor by Mitsuba's name, a medium with dispersion, or a file (`materials.index_of`).
         ext_ior: in rigorous theory, index of the medium above relative to air, for a grating under a coat; wavelengths
             are those in this medium.
         polarised: in rigorous theory, whether to store Mueller matrices for polarised variants; the table is then
@@ -76,7 +76,7 @@ class Settings:
     terms: int | None = None
     heights_from: str = "mean"
     theory: str = "scalar"
-    int_ior: complex | None = None
+    int_ior: complex | str | None = None
     material: str | None = None
     ext_ior: float = 1.0
     polarised: bool = False
@@ -114,6 +114,9 @@ class Settings:
             )
         object.__setattr__(self, "wavelengths", (shortest, longest))
         self._check_series()
+        if isinstance(self.int_ior, str) and self.material is None:
+            object.__setattr__(self, "material", self.int_ior)
+            object.__setattr__(self, "int_ior", None)
         if not isinstance(self.polarised, bool):
             raise RequestError(f"polarised: got {self.polarised!r}, wanted True or False")
         if self.theory == "rigorous" and (self.extent, self.largest_angle, self.representation) != ("tile", 90, "auto"):
@@ -130,7 +133,8 @@ class Settings:
         if self.transmission != "none":
             if self.int_ior is None or np.imag(self.int_ior) != 0:
                 raise RequestError(
-                    f"transmission: got {self.transmission} and int_ior {self.int_ior!r}, wanted a dielectric"
+                    f"transmission: got {self.transmission} with material {self.material!r} and int_ior "
+                    f"{self.int_ior!r}, wanted a dielectric of one index, a number"
                 )
             if self.ext_ior != 1:
                 raise RequestError(

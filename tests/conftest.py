@@ -83,10 +83,10 @@ def results_of_a_session():
     """Compute E of equal spectra and the solved error of equal profiles once."""
     energy_of, solved_error, energies, errors = EnergyTable.of, scalar_theory._solved_error, {}, {}
 
-    def energy(spectrum, ratios=(1.0,), index=None, laterals=(1.0, 1.0)):
-        key = spectrum.digest, tuple(ratios), index, tuple(laterals)
+    def energy(spectrum, ratios=(1.0,), stack=None, laterals=(1.0, 1.0)):
+        key = spectrum.digest, tuple(ratios), stack, tuple(laterals)
         if key not in energies:
-            energies[key] = energy_of(spectrum, ratios, index, laterals)
+            energies[key] = energy_of(spectrum, ratios, stack, laterals)
         return energies[key]
 
     def error(profile):

@@ -21,7 +21,7 @@ MODULES = {
 
 LEVELS = {
     # The lowest first: modules of a level import from the levels above it in this list, and from their own.
-    "base": "color errors files geometry llvm manual outputs progress settings",
+    "base": "color errors files geometry llvm manual materials outputs progress settings stack",
     "surface": "surface",
     "spectrum": "spectrum",
     "energy": "energy",

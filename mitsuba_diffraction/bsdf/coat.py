@@ -14,13 +14,12 @@ from __future__ import annotations
 
 import drjit as dr
 import mitsuba as mi
-import numpy as np
 
-from ..errors import RequestError, is_number
-from .base import nested_plugin
+from ..errors import RequestError
+from ..materials import RefractiveIndex
+from .indices import Dispersion, absolute_index, index_from
 from .tables import opaque
 
-MIN_INDEX, MAX_INDEX = 0.01, 100.0
 SAME_INDEX = 1e-3  # indices of refraction that differ by less, as those of air and vacuum, are taken as equal
 
 
@@ -32,51 +31,40 @@ def coat_from(props: mi.Properties) -> Coat | None:
     """
     if "coat_ior" not in props:
         return None
-    coat = Coat(props["coat_ior"], props.get("ext_ior", "air"))
+    coat = Coat(index_from("coat_ior", props["coat_ior"]), absolute_index("ext_ior", props.get("ext_ior", "air")))
     return None if coat.relative < 1 + SAME_INDEX else coat
-
-
-def absolute_index(name: str, index: float | str) -> float:
-    """Return an index of refraction from a number or the name of a preset, as in Mitsuba's `dielectric`.
-
-    Raises:
-        RequestError: if it is neither.
-    """
-    if not isinstance(index, str):
-        if not (is_number(index) and MIN_INDEX <= index <= MAX_INDEX):
-            raise RequestError(
-                f"{name}: got {index!r}, wanted a positive index of refraction, or a name such as 'bk7' "
-                f"({MIN_INDEX:g} to {MAX_INDEX:g})"
-            )
-        index = float(index)
-    try:
-        interface = nested_plugin("dielectric", int_ior=index, ext_ior=1.0)
-    except RuntimeError as error:
-        known = str(error).partition("Valid choices are:")[2].strip()
-        raise RequestError(f"{name}: got {index!r}, wanted a number or one of {known}") from None
-    return float(np.ravel(mi.traverse(interface)["eta"])[0])
 
 
 class Coat:
     """A clear plane layer.
 
     Attributes:
-        index: n, absolute.
-        relative, eta: n relative to the outside, as a number and as an array.
+        medium: n of the layer, absolute, over the wavelength.
+        index: n in the middle of visible light.
+        relative, eta: this n relative to the outside, as a number and as an array.
+        dispersion: n relative to the outside over the wavelength; None if it is constant.
     """
 
-    def __init__(self, index: float | str, outside: float | str) -> None:
-        self.index = absolute_index("coat_ior", index)
-        outer = absolute_index("ext_ior", outside)
-        if self.index < max(1, (1 - SAME_INDEX) * outer):
-            raise RequestError(f"coat_ior: got {self.index:g}, wanted at least one and that of the outside, {outer:g}")
-        self.relative = max(self.index / outer, 1.0)
+    def __init__(self, medium: RefractiveIndex, outside: float) -> None:
+        self.medium, self.index = medium, medium.nominal.real
+        if self.index < max(1, (1 - SAME_INDEX) * outside):
+            raise RequestError(
+                f"coat_ior: got {self.index:g}, wanted at least one and that of the outside, {outside:g}"
+            )
+        self.relative = max(self.index / outside, 1.0)
         self.eta = opaque(self.relative)
+        self.dispersion = None if medium.is_constant else Dispersion(medium, outside)
+
+    def etas(self, si: mi.SurfaceInteraction3f) -> list[mi.Float]:
+        """Return n of each wavelength, relative to the outside."""
+        if self.dispersion is None:
+            return [self.eta] * len(si.wavelengths)
+        return [self.dispersion(wavelength).real for wavelength in si.wavelengths]
 
     def cos_inside(self, cos: mi.Float) -> mi.Float:
-        """Return cos θ' for the cosine of an angle outside."""
+        """Return cos θ' for the cosine of an angle outside, in the middle of visible light."""
         return dr.safe_sqrt(1 - (1 - dr.square(cos)) / dr.square(self.eta))
 
-    def reflectance(self, cos: mi.Float) -> mi.Float:
+    def reflectance(self, si: mi.SurfaceInteraction3f, cos: mi.Float) -> mi.UnpolarizedSpectrum:
         """Return F at the cosine of an angle outside."""
-        return mi.fresnel(cos, self.eta)[0]
+        return mi.UnpolarizedSpectrum([mi.fresnel(cos, eta)[0] for eta in self.etas(si)])

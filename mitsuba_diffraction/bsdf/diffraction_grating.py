@@ -10,11 +10,13 @@ import mitsuba as mi
 
 from ..errors import RequestError
 from ..manual import Parameter, listed
+from ..materials import DISPERSION
 from ..recipe import Recipe, parameters_of_profile
 from ..surface.gratings import PROFILES
 from .base import base_from
 from .layers import Layers
 from .parameters import GratingRequest
+from .thin_film import MAX_THICKNESS
 
 PARAMETERS = (
     Parameter("filename", "string", "a saved spectrum (.exr) or a recipe (.toml)"),
@@ -44,20 +46,36 @@ PARAMETERS = (
         "spectra specify their own. Rigorous theory refuses height_scale, lateral_scale, shadowing and base",
         "scalar",
     ),
-    Parameter("int_ior, ext_ior", "float or string", "a dielectric, as in Mitsuba's `dielectric`", "1.5, air"),
+    Parameter(
+        "int_ior, ext_ior",
+        "float or string",
+        "a dielectric, as in Mitsuba's `dielectric`; int_ior also a medium with dispersion "
+        f"({', '.join(DISPERSION)}) or the file of a table (.spd, .csv, .yml)",
+        "1.5, air",
+    ),
     Parameter(
         "material",
         "string",
-        'a conductor instead, as in Mitsuba\'s `conductor`, or Ti; "none" is the perfect mirror, R = 1',
+        'a conductor instead, as in Mitsuba\'s `conductor`, or Ti, or the file of a table; "none" is the perfect '
+        "mirror, R = 1",
     ),
+    Parameter("eta, k", "float, spectrum or texture", "the index η + ik of a conductor instead, k is 0 by default"),
     Parameter(
         "thin_film_thickness",
         "float, texture or string",
-        "thickness of a film on the relief, µm along the normal, at most 2; a string is the file of a picture, whose "
-        "integers are from 0 (black) to 1 µm (white). Scalar theory only",
+        "thickness of a film on the relief, µm along the normal; a string is the file of a picture, whose integers are "
+        "from 0 (black) to 1 µm (white), or a list of the thicknesses of several films, from the outside in, at most "
+        f"{MAX_THICKNESS:g} in all. Scalar theory only",
         "0",
     ),
-    Parameter("thin_film_ior", "float or string", "index of the film, as int_ior, or a name as of material", "none"),
+    Parameter(
+        "thin_film_ior",
+        "float or string",
+        "index of the film, as int_ior, or as material; or a list of as many indices, such as 2.35, 1.38, 2.35 or "
+        "8 x (2.35, 1.38)",
+        "none",
+    ),
+    Parameter("thin_film_scale", "float, texture or string", "factor of the thickness of all films", "1"),
     Parameter(
         "orientation",
         "float, texture or string",
@@ -146,8 +164,9 @@ def refuse_wrong(props: mi.Properties) -> None:
         is_texture = isinstance(objects.get(name), mi.Texture) and "texture" in wanted
         # Vectors are refused as other numbers and names are.
         is_vector = kind == kinds.Vector and (wanted in ("float", "float or string") or name == "material")
+        is_spectrum = "spectrum" in wanted and kind == kinds.Spectrum
         is_plain = kind in (kinds.Bool, kinds.Integer, kinds.Float, kinds.String)
-        if not (is_plain or is_base or is_texture or is_vector):
+        if not (is_plain or is_base or is_texture or is_spectrum or is_vector):
             got = type(objects[name]).__name__ if name in objects else kind.name.lower()
             raise RequestError(f"{name}: got a {got}, wanted {wanted}")
 

@@ -2,19 +2,19 @@
 
 from __future__ import annotations
 
-from pathlib import Path
 from typing import Any
 
 import drjit as dr
 import mitsuba as mi
 import numpy as np
-from numpy.typing import NDArray
 
 from ..errors import RequestError
-from ..rigorous.materials import conductor
-from ..settings import VISIBLE
+from ..materials import MAX_INDEX, MIN_INDEX, RefractiveIndex, constant, index_of, is_file
+from ..stack import Stack
 from .base import nested_plugin
-from .coat import MAX_INDEX, MIN_INDEX, Coat, absolute_index
+from .coat import Coat
+from .indices import Dispersion, absolute_index, index_from, nodes_of
+from .tables import opaque
 
 
 class Material:
@@ -23,9 +23,10 @@ class Material:
     Attributes:
         transparent: whether transmitted light is not absorbed.
         wavelengths: range in which the reflectance is known, nm.
-        eta: relative index of refraction, a mi.Float; of a metal its real part, a mi.Texture; else None.
+        eta: relative index of refraction in the middle of visible light, a mi.Float; None if there is none.
         outside: absolute index of the medium above, to which indices are relative.
         varies: whether the material varies over the surface.
+        dispersion: the relative index of a transparent material over the wavelength; None if it is constant.
     """
 
     transparent: bool = False
@@ -33,6 +34,7 @@ class Material:
     eta: Any = None
     outside: float = 1.0
     varies: bool = False
+    dispersion: Dispersion | None = None
 
     def __call__(self, si: mi.SurfaceInteraction3f, cos_half: mi.Float, active: mi.Bool) -> mi.UnpolarizedSpectrum:
         """Return R at the cosine ω_i·h, negative for light from below."""
@@ -47,6 +49,10 @@ class Material:
 
     def index(self, si: mi.SurfaceInteraction3f, active: mi.Bool) -> list[mi.Complex2f]:
         """Return n + ik of each wavelength."""
+        raise NotImplementedError
+
+    def stack(self, eta: float) -> Stack:
+        """Return the transparent material for E and samplers; `eta` replaces a constant index."""
         raise NotImplementedError
 
     def planes(
@@ -68,26 +74,44 @@ class Material:
 
 
 def reflectance_from(props: mi.Properties, coat: Coat | None) -> Material:
-    """Return the material given by `int_ior`, `ext_ior` and `material`, relative to a coat if there is one.
+    """Return the material given by `int_ior`, `ext_ior`, `material`, `eta` and `k`, relative to a coat if there is one.
 
     Raises:
         RequestError: if they contradict each other or are unknown.
     """
-    if "material" not in props:
-        outside = props.get("ext_ior", "air")
-        return Dielectric(props.get("int_ior", 1.5), outside if coat is None else coat.index)
+    own = [name for name in ("eta", "k") if name in props]
+    if "material" not in props and not own:
+        outside = coat.index if coat is not None else absolute_index("ext_ior", props.get("ext_ior", "air"))
+        return Dielectric(index_from("int_ior", props.get("int_ior", 1.5)), outside)
+    named = own[0] if own else "material"
     if "int_ior" in props or ("ext_ior" in props and "coat_ior" not in props):
         raise RequestError(
-            "material: a conductor or a perfect mirror takes no int_ior or ext_ior; give one or the other"
+            f"{named}: a conductor or a perfect mirror takes no int_ior or ext_ior; give one or the other"
         )
+    # There is no coat if its index is that of the outside.
+    outside = coat.index if coat is not None else absolute_index("ext_ior", props.get("ext_ior", 1.0))
+    if own:
+        if "material" in props or own == ["k"]:
+            raise RequestError(f"{named}: got {' and '.join(own)}, wanted eta and k, or material, one or the other")
+        return SpectralConductor(props.get_texture("eta"), props.get_texture("k", 0.0), outside)
     material = props["material"]
     if not isinstance(material, str):
         raise RequestError(f"material: got {material!r}, wanted the name of a conductor, such as 'Al', or 'none'")
     if material == "none":
         return PerfectMirror()
-    # There is no coat if its index is that of the outside.
-    outside = coat.index if coat is not None else absolute_index("ext_ior", props.get("ext_ior", 1.0))
-    return Conductor(material, outside)
+    return Conductor(conductor_from(material), outside)
+
+
+def conductor_from(material: str) -> RefractiveIndex:
+    """Return the index of the parameter `material`: the name of a conductor, or a file.
+
+    Raises:
+        RequestError: if there is none.
+    """
+    try:
+        return index_of("material", str(mi.file_resolver().resolve(material)) if is_file(material) else material)
+    except RequestError as error:
+        raise RequestError(f"{error}; none is the perfect mirror, R = 1") from None
 
 
 class PerfectMirror(Material):
@@ -104,13 +128,16 @@ class PerfectMirror(Material):
 
 
 class Dielectric(Material):
-    """A dielectric of relative index η without absorption or dispersion, as Mitsuba's `dielectric`."""
+    """A dielectric of relative index η without absorption, as Mitsuba's `dielectric`, or with dispersion."""
 
     transparent = True
 
-    def __init__(self, int_ior: float | str, ext_ior: float | str) -> None:
-        self.outside = absolute_index("ext_ior", ext_ior)
-        self.eta = mi.Float(absolute_index("int_ior", int_ior) / self.outside)
+    def __init__(self, medium: RefractiveIndex, outside: float) -> None:
+        self.medium, self.outside = medium, outside
+        self.eta = mi.Float(medium.nominal.real / outside)
+        if not medium.is_constant:
+            self.dispersion = Dispersion(medium, outside)
+            self.wavelengths = self.dispersion.wavelengths
         self.update()
 
     def update(self) -> None:
@@ -126,55 +153,54 @@ class Dielectric(Material):
                 f"eta: got {np.ravel(values)[0]:g}, wanted a positive relative index, {MIN_INDEX:g} to {MAX_INDEX:g}"
             )
 
+    def _etas(self, si: mi.SurfaceInteraction3f) -> list[mi.Float]:
+        if self.dispersion is None:
+            return [self.eta] * len(si.wavelengths)
+        return [self.dispersion(wavelength).real for wavelength in si.wavelengths]
+
     def __call__(self, si: mi.SurfaceInteraction3f, cos_half: mi.Float, active: mi.Bool) -> mi.UnpolarizedSpectrum:
-        return mi.UnpolarizedSpectrum(mi.fresnel(cos_half, self.eta)[0])
+        return mi.UnpolarizedSpectrum([mi.fresnel(cos_half, eta)[0] for eta in self._etas(si)])
 
     def index(self, si: mi.SurfaceInteraction3f, active: mi.Bool) -> list[mi.Complex2f]:
-        return [mi.Complex2f(self.eta, 0)] * len(si.wavelengths)
+        return [mi.Complex2f(eta, 0) for eta in self._etas(si)]
+
+    def stack(self, eta: float) -> Stack:
+        below = constant(eta * self.outside) if self.dispersion is None else self.medium
+        return Stack(self.outside, below)
 
     def planes(
         self, si: mi.SurfaceInteraction3f, cos_half: mi.Float, reflects: mi.Bool, active: mi.Bool
     ) -> list[mi.Matrix4f]:
-        cos, eta = dr.abs(cos_half), dr.select(cos_half > 0, self.eta, dr.rcp(self.eta))
-        reflection = mi.mueller.specular_reflection(cos, mi.Complex2f(eta, 0))
-        return [dr.select(reflects, reflection, mi.mueller.specular_transmission(cos, eta))] * len(si.wavelengths)
+        found = []
+        for index in self._etas(si):
+            cos, eta = dr.abs(cos_half), dr.select(cos_half > 0, index, dr.rcp(index))
+            reflection = mi.mueller.specular_reflection(cos, mi.Complex2f(eta, 0))
+            found.append(dr.select(reflects, reflection, mi.mueller.specular_transmission(cos, eta)))
+        return found
 
     def traverse(self, callback: mi.TraversalCallback) -> None:
-        callback.put("eta", self.eta, mi.ParamFlags.Differentiable)
+        if self.dispersion is None:
+            callback.put("eta", self.eta, mi.ParamFlags.Differentiable)
 
     def __repr__(self) -> str:
-        return f"dielectric, eta = {self.eta}"
+        return f"dielectric, eta = {self.eta}" if self.dispersion is None else f"dielectric, {self.medium}"
 
 
-class Conductor(Material):
-    """A metal of index η + ik, named as in Mitsuba's `conductor`; under a coat, relative to the index of the coat."""
+class SpectralConductor(Material):
+    """A metal whose η + ik is given by two spectra, as in Mitsuba's `conductor`."""
 
-    def __init__(self, material: str, outside: float) -> None:
-        data = Path(str(mi.file_resolver().resolve("data/ior/Al.eta.spd"))).parent
-        try:
-            wavelengths, *index = conductor(material, data)
-        except RequestError as error:
-            raise RequestError(f"{error}; none is the perfect mirror, R = 1") from None
-        # In visible light constant where the table ends.
-        grid = np.arange(
-            min(VISIBLE[0], np.ceil(wavelengths[0] * 1e3)), max(VISIBLE[1], np.floor(wavelengths[-1] * 1e3)) + 1
-        )
-        self.wavelengths = float(grid[0]), float(grid[-1])
-        self.eta, self.k = (self._spectrum(grid, np.interp(grid * 1e-3, wavelengths, n) / outside) for n in index)
-        self.material, self.outside = material, outside
-
-    @staticmethod
-    def _spectrum(grid: NDArray[np.float64], values: NDArray[np.float64]) -> mi.Texture:
-        """Make a texture from the values at equidistant wavelengths in nm."""
-        # A look-up in an irregular table is a search, which took half of the rendering time.
-        text = ", ".join(repr(float(value)) for value in values)
-        return nested_plugin("regular", wavelength_min=float(grid[0]), wavelength_max=float(grid[-1]), values=text)
+    def __init__(self, eta: mi.Texture, k: mi.Texture, outside: float) -> None:
+        self.textures, self.outside = (eta, k), outside
+        self._divisor = None if outside == 1 else opaque(outside)
+        self.varies = eta.is_spatially_varying() or k.is_spatially_varying()
 
     def __call__(self, si: mi.SurfaceInteraction3f, cos_half: mi.Float, active: mi.Bool) -> mi.UnpolarizedSpectrum:
         return mi.UnpolarizedSpectrum([mi.fresnel_conductor(cos_half, n) for n in self.index(si, active)])
 
     def index(self, si: mi.SurfaceInteraction3f, active: mi.Bool) -> list[mi.Complex2f]:
-        eta, k = self.eta.eval(si, active), self.k.eval(si, active)
+        eta, k = (texture.eval(si, active) for texture in self.textures)
+        if self._divisor is not None:
+            eta, k = eta / self._divisor, k / self._divisor
         return [mi.Complex2f(*of_channel) for of_channel in zip(eta, k, strict=True)]
 
     def planes(
@@ -183,8 +209,31 @@ class Conductor(Material):
         return [mi.mueller.specular_reflection(cos_half, n) for n in self.index(si, active)]
 
     def traverse(self, callback: mi.TraversalCallback) -> None:
-        callback.put("eta", self.eta, mi.ParamFlags.Differentiable)
-        callback.put("k", self.k, mi.ParamFlags.Differentiable)
+        for name, texture in zip(("eta", "k"), self.textures, strict=True):
+            callback.put(name, texture, mi.ParamFlags.Differentiable)
 
     def __repr__(self) -> str:
-        return f"conductor, {self.material}"
+        return "conductor, eta and k"
+
+
+class Conductor(SpectralConductor):
+    """A metal of index η + ik, named as in Mitsuba's `conductor` or from a file; under a coat, relative to it."""
+
+    def __init__(self, medium: RefractiveIndex, outside: float) -> None:
+        grid = nodes_of(medium)
+        values = medium(grid * 1e-3) / outside
+        # A look-up in an irregular table is a search, which took half of the rendering time.
+        of_n, of_k = (
+            nested_plugin(
+                "regular",
+                wavelength_min=float(grid[0]),
+                wavelength_max=float(grid[-1]),
+                values=", ".join(repr(float(value)) for value in part),
+            )
+            for part in (values.real, values.imag)
+        )
+        super().__init__(of_n, of_k, 1.0)
+        self.medium, self.outside, self.wavelengths = medium, outside, (float(grid[0]), float(grid[-1]))
+
+    def __repr__(self) -> str:
+        return f"conductor, {self.medium}"

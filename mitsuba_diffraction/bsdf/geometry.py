@@ -15,6 +15,7 @@ that of κ₁, and S by κ₁²/κ² S (`furnace.small_kappa`).
 
 from __future__ import annotations
 
+import copy
 import dataclasses
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -23,6 +24,7 @@ import drjit as dr
 import mitsuba as mi
 
 from .. import geometry
+from .indices import Dispersion
 from .tables import integer_part, larger, limited, smaller
 
 
@@ -83,6 +85,8 @@ class Interface:
         transmitted_fraction: returns the transmitted fraction of power for a direction along the pattern's axes, where
             an `OrderSampler` draws orders; None for rigorous theory and where orders overlap, which use that of a
             plane.
+        disperses: whether the index of the coat or that below varies with the wavelength; `coat_index` and `eta` are
+            those in the middle of visible light, and `at` returns those of a wavelength.
     """
 
     def __init__(
@@ -93,6 +97,7 @@ class Interface:
         rigorous: bool = False,
         kappas: tuple[mi.Float, mi.Float] | None = None,
         transmitted_fraction: Callable[[mi.Vector3f], mi.Float] | None = None,
+        dispersions: tuple[Dispersion | None, Dispersion | None] = (None, None),
     ) -> None:
         self.coat_index, self.transmits, self.is_sheet = mi.Float(coat_index), eta is not None, is_sheet
         self.rigorous, self.kappas, self.transmitted_fraction = rigorous, kappas, transmitted_fraction
@@ -100,6 +105,19 @@ class Interface:
         self.mirrors_q = self.kappa_has_sign and transmitted_fraction is None
         # In reflection literals, so that Dr.Jit eliminates the terms of the medium below.
         self.eta = mi.Float(1.0) if eta is None else eta
+        self._dispersions = dispersions
+        self.disperses = any(dispersions)
+
+    def at(self, wavelength: mi.Float) -> Interface:
+        """Return the interface with its indices at a wavelength in vacuum, nm."""
+        if not self.disperses:
+            return self
+        result, (of_coat, below) = copy.copy(self), self._dispersions
+        if of_coat is not None:
+            result.coat_index = of_coat(wavelength).real
+        if below is not None:
+            result.eta = below(wavelength).real
+        return result
 
     def min_kappa(self, height_scale: mi.Float) -> mi.Float:
         """Return κ₁ in rad/µm, at most the κ of the undiffracted order at all wavelengths."""

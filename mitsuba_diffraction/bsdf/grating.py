@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import functools
+from collections.abc import Callable
 
 import drjit as dr
 import mitsuba as mi
@@ -11,6 +12,7 @@ import numpy as np
 from ..errors import RequestError
 from ..progress import progress_bar
 from ..recipe import Recipe
+from .energy import Coordinates
 from .geometry import Geometry, Incidence, Interface, rotated
 from .parameters import GratingRequest
 from .polarisation import reflected, through_layer
@@ -22,6 +24,8 @@ from .varying import check_texture
 # directions are grazing, K G grows so fast that samples in proportion to the cosine would have large weights.
 UNIFORM_PROBABILITY = 0.02
 _per_cent = functools.partial(progress_bar, unit="%")
+_Pair = tuple[Geometry, Incidence, tuple[Coordinates, Coordinates] | None]
+"""Two directions, the incident light, the coordinates of both in the table of E."""
 
 
 class Grating:
@@ -142,7 +146,6 @@ class Grating:
         wi, wo = rotated(si.wi, sin, cos), rotated(wo, sin, cos)
         k_i, k_o = self.interface.wave_vector(wi), self.interface.wave_vector(wo)
         u, v = -k_i.tangent - k_o.tangent
-        outside = dr.abs(mi.Frame3f.cos_theta(wo)) * dr.square(k_o.index)
         side_probability = dr.select(k_i.sign == k_o.sign, 1 - transmission_probability, transmission_probability)
         covered, si = self._covered(si)
         count = _count(covered)
@@ -150,7 +153,10 @@ class Grating:
         height_scale, lateral_scale = self.scales.at(si, active)
         pending = mi.UInt32(0)
         for channel, in_lobe in enumerate(covered):
-            frequency = lateral_scale * dr.rcp(self._wavelength(si, channel))
+            if self.interface.disperses:
+                at = self.interface.at(si.wavelengths[channel])
+                u, v = -at.wave_vector(wi).tangent - at.wave_vector(wo).tangent
+            frequency = lateral_scale * dr.rcp(self._above(si.wavelengths[channel]))
             in_lobe &= self.theory.scattering.meets(u * frequency, v * frequency, lateral_scale)
             pending |= dr.select(active & in_lobe, mi.UInt32(1 << channel), 0)
         # Most directions lie outside of all lobes at all wavelengths; unless drawn, they skip the branch.
@@ -161,12 +167,12 @@ class Grating:
             value, density = diffracted(wi, wo, height_scale, lateral_scale)
         # The mean over the covered wavelengths, as each of them is chosen with the same probability.
         uniform = _uniform_probability(count)
-        density = (1 - uniform) * density * outside / larger(count, 1)
+        density = (1 - uniform) * density * dr.abs(mi.Frame3f.cos_theta(wo)) / larger(count, 1)
         return value, side_probability * dr.fma(uniform, dr.inv_two_pi, density)
 
-    def _wavelength(self, si: mi.SurfaceInteraction3f, channel: int) -> mi.Float:
-        """Return λ in the medium above, µm."""
-        return si.wavelengths[channel] * (1e-3 / self.theory.media.outside)
+    def _above(self, wavelength: mi.Float) -> mi.Float:
+        """Return λ in the medium above, µm, from λ in vacuum, nm."""
+        return wavelength * (1e-3 / self.theory.media.outside)
 
     def _diffracted(
         self,
@@ -182,63 +188,87 @@ class Grating:
 
         `pending` has a bit for each covered wavelength at which ω_o lies in the lobe of an order or orders overlap.
         """
-        interface = self.interface
+        pair = self._pair(self.interface, wi, wo, height_scale)
+        geometry, incidence, coordinates = pair
+        # Directions at angles that are not covered are black, but have a density, as they are drawn.
+        within = smaller(*geometry.cosines()) >= self.min_cosine
+        if self.interface.disperses:
+
+            def at(state: tuple, wavelength: mi.Float) -> tuple[_Pair, mi.Float | float]:
+                interface, si_of_one = self.interface.at(wavelength), mi.SurfaceInteraction3f(si)
+                si_of_one.wavelengths = mi.UnpolarizedSpectrum(wavelength)
+                of_one = self._pair(interface, *state)
+                return of_one, self.theory.reflectance(si_of_one, of_one[0], active)[0]
+
+            value, density = self._of_wavelengths(si, pending, at, (wi, wo, height_scale), lateral_scale)
+            return dr.select(within, value, 0), density
+
+        def constant(state: tuple, wavelength: mi.Float) -> tuple[_Pair, mi.Float | float]:
+            return (state[0], incidence, state[1]), 1.0
+
+        value, density = self._of_wavelengths(si, pending, constant, (geometry, coordinates), lateral_scale)
+        value = dr.select(within, value * self.theory.reflectance(si, geometry, active), 0)
+        return value, density
+
+    def _pair(self, interface: Interface, wi: mi.Vector3f, wo: mi.Vector3f, height_scale: mi.Float) -> _Pair:
+        """Return the geometry of two directions, the incident light, and the coordinates in the table of E."""
         k_i, k_o = interface.wave_vector(wi), interface.wave_vector(wo)
         geometry = Geometry.of(k_i, k_o, interface, height_scale, self.theory.shadowing)
         incidence = Incidence.of(k_i, k_o, interface, height_scale, geometry.kappa_sign)
-        pair = self.theory.coordinates(geometry)
-        value, density = self._of_wavelengths(si, incidence, pending, geometry, pair, lateral_scale)
-        # Directions at angles that are not covered are black, but have a density, as they are drawn.
-        within = smaller(*geometry.cosines()) >= self.min_cosine
-        value = dr.select(within, value * self.theory.reflectance(si, geometry, active), 0)
-        return value, density
+        return geometry, incidence, self.theory.coordinates(geometry)
 
     @dr.syntax
     def _of_wavelengths(
         self,
         si: mi.SurfaceInteraction3f,
-        incidence: Incidence,
         pending: mi.UInt32,
-        geometry: Geometry,
-        pair: tuple | None,
+        at: Callable[[tuple, mi.Float], tuple[_Pair, mi.Float | float]],
+        state: tuple,
         lateral_scale: mi.Float,
     ) -> tuple[mi.UnpolarizedSpectrum, mi.Float]:
-        """Return f cos θ_o without R at the wavelengths in `pending`, and the sum of their densities.
+        """Return f cos θ_o at the wavelengths in `pending`, and the sum of their densities times n_o².
 
         Each iteration evaluates one wavelength of each ray; few rays have several. A loop keeps the kernel small; with
         gradients it is unrolled, as Dr.Jit cannot differentiate it in reverse mode.
+
+        Args:
+            si, pending: as of `_diffracted`.
+            at: returns the pair of directions, and a factor of the value, from `state` at a wavelength in nm.
+            state: all arrays with derivatives.
+            lateral_scale: of lengths along the surface.
         """
         value, density = mi.UnpolarizedSpectrum(0.0), mi.Float(0.0)
-        add_wavelength = functools.partial(self._add_wavelength, si, incidence)
-        if dr.hint(dr.grad_enabled(geometry, lateral_scale), mode="scalar"):
+        add_wavelength = functools.partial(self._add_wavelength, si, at)
+        if dr.hint(dr.grad_enabled(state, lateral_scale), mode="scalar"):
             for _ in range(len(value)):
-                pending, value, density = add_wavelength(geometry, pair, lateral_scale, pending, value, density)
+                pending, value, density = add_wavelength(state, lateral_scale, pending, value, density)
         else:
             while pending != 0:
-                pending, value, density = add_wavelength(geometry, pair, lateral_scale, pending, value, density)
+                pending, value, density = add_wavelength(state, lateral_scale, pending, value, density)
         return value, density
 
     def _add_wavelength(
         self,
         si: mi.SurfaceInteraction3f,
-        incidence: Incidence,
-        geometry: Geometry,
-        pair: tuple | None,
+        at: Callable[[tuple, mi.Float], tuple[_Pair, mi.Float | float]],
+        state: tuple,
         lateral_scale: mi.Float,
         pending: mi.UInt32,
         value: mi.UnpolarizedSpectrum,
         density: mi.Float,
     ) -> tuple[mi.UInt32, mi.UnpolarizedSpectrum, mi.Float]:
         """Evaluate the first wavelength in `pending`; return `pending` without it, and the sums including it."""
-        first_bit, wavelength = pending & (0 - pending), self._wavelength(si, 0)
+        first_bit, wavelength = pending & (0 - pending), si.wavelengths[0]
         chosen = [first_bit == (1 << channel) for channel in range(len(value))]
         for channel in range(1, len(value)):
-            wavelength = dr.select(chosen[channel], self._wavelength(si, channel), wavelength)
-        incidence = incidence.at(wavelength / lateral_scale, lateral_scale)
+            wavelength = dr.select(chosen[channel], si.wavelengths[channel], wavelength)
+        (geometry, incidence, pair), factor = at(state, wavelength)
+        incidence = incidence.at(self._above(wavelength) / lateral_scale, lateral_scale)
         power, probability = self.theory.evaluate(geometry, incidence, pair, pending != 0)
         square = dr.square(incidence.frequency)
-        power *= square
+        power *= square * factor
         value += mi.UnpolarizedSpectrum([dr.select(c, power, 0) for c in chosen])
+        probability *= dr.square(geometry.outgoing.index)
         return pending - first_bit, value, dr.fma(probability, square, density)
 
     def mueller(
@@ -255,13 +285,17 @@ class Grating:
         """
         _, si = self._covered(si)
         directions, interface = (si.wi, wo), self.interface
+        at = [interface.at(wavelength) for wavelength in si.wavelengths]
         if interface.transmits and not interface.is_sheet and ctx.mode == mi.TransportMode.Radiance:
             # Radiance scales with n².
-            k_i, k_o = interface.wave_vector(si.wi), interface.wave_vector(wo)
-            value *= dr.square(k_i.index / k_o.index)
+            vectors = [[of_channel.wave_vector(omega) for omega in directions] for of_channel in at]
+            value *= mi.UnpolarizedSpectrum([dr.square(k_i.index / k_o.index) for k_i, k_o in vectors])
         if not mi.is_polarized:
             for omega in directions:
-                value *= self._face_transmittance(omega)
+                if self.coat is not None:
+                    value *= 1 - self.coat.reflectance(si, omega.z)
+                elif interface.has_flat_face:
+                    value *= mi.UnpolarizedSpectrum([i.flat_face_transmittance(omega) for i in at])
             return value
         split = self.theory.split(value, si, self.frame(si, active), active)
         if self.coat is None and not interface.has_flat_face:
@@ -271,12 +305,6 @@ class Grating:
             eta, has_face = self.coat.eta, [mi.Bool(True)] * 2
         inside = [interface.wave_vector(omega).inner() for omega in directions]
         return through_layer(split, eta, directions, inside, has_face, ctx.mode)
-
-    def _face_transmittance(self, omega: mi.Vector3f) -> mi.Float:
-        """Return 1 − F of the face of a coat or sheet between the relief and a direction; one where there is none."""
-        if self.coat is not None:
-            return 1 - self.coat.reflectance(omega.z)
-        return self.interface.flat_face_transmittance(omega) if self.interface.has_flat_face else mi.Float(1.0)
 
     def _covered(self, si: mi.SurfaceInteraction3f) -> tuple[list[mi.Bool], mi.SurfaceInteraction3f]:
         """Return which of the wavelengths the spectrum and the material cover, and the point with covered ones only.
@@ -294,7 +322,7 @@ class Grating:
     def transmittance(self, si: mi.SurfaceInteraction3f, cos: mi.Float, active: mi.Bool) -> mi.UnpolarizedSpectrum:
         """Return T of a plane, times that of the coat, at the cosine of an angle outside."""
         transmitted = self._powers(si, cos, active)[1]
-        return transmitted if self.coat is None else (1 - self.coat.reflectance(cos)) * transmitted
+        return transmitted if self.coat is None else (1 - self.coat.reflectance(si, cos)) * transmitted
 
     def reflectance(self, si: mi.SurfaceInteraction3f, cos: mi.Float, active: mi.Bool) -> mi.UnpolarizedSpectrum:
         """Return R of a plane below the coat, at the cosine of an angle outside."""
@@ -328,16 +356,17 @@ class Grating:
         # Only covered wavelengths are chosen.
         chosen = smaller(dr.floor(u * count), larger(count - 1, 0))
         rest = limited(u * count - chosen, 0, BELOW_ONE)
-        wavelength, rank = self._wavelength(si, 0), mi.Float(0.0)
+        wavelength, rank = si.wavelengths[0], mi.Float(0.0)
         for channel, is_covered in enumerate(covered):
-            wavelength = dr.select(is_covered & (rank == chosen), self._wavelength(si, channel), wavelength)
+            wavelength = dr.select(is_covered & (rank == chosen), si.wavelengths[channel], wavelength)
             rank += dr.select(is_covered, 1, 0)
         sin, cos = self.frame(si, active)
         height_scale, lateral_scale = self.scales.at(si, active)
+        interface = interface.at(wavelength)
         k_i = interface.wave_vector(rotated(si.wi, sin, cos))
         k_o = interface.scattered(k_i, reflects)
         incidence = Incidence.of(k_i, k_o, interface, height_scale)
-        incidence = incidence.at(dr.detach(wavelength / lateral_scale), dr.detach(lateral_scale))
+        incidence = incidence.at(dr.detach(self._above(wavelength) / lateral_scale), dr.detach(lateral_scale))
         q, propagates = self.theory.scattering.sample(incidence, rest, v, active & ~uniform)
         tangent = k_o.tangent - incidence.wavelength * incidence.q_sign * q
         wo = rotated(mi.Vector3f(*tangent, 0), -sin, cos) / k_o.index
@@ -351,7 +380,7 @@ class Grating:
             f"{self.spectrum.extent} = {self.spectrum.grid}",
             f"coherence_length = {self.spectrum.coherence_length:g} um",
             f"representation = {self.spectrum.representation}, {self.spectrum.megabytes:.3g} MB",
-            *([] if self.coat is None else [f"coat = n = {self.coat.index:g}"]),
+            *([] if self.coat is None else [f"coat = n = {self.coat.medium}"]),
             f"orientation = {self.orientation}{' from the radius' if self.from_radius else ''}",
             str(self.theory),
         ]

@@ -120,13 +120,13 @@ class Layers:
         cos = mi.Frame3f.cos_theta(si.wi)
         rest = request.grating or request.base is not None
         if self.coat is None:
-            return dr.select(cos < 0, dr.detach(self._face(si)) if rest else mi.Float(1.0), 0)
+            return dr.select(cos < 0, dr.detach(dr.mean(self._face(si))) if rest else mi.Float(1.0), 0)
         if not rest:
             return mi.Float(1.0)
         reflected = self.grating.reflectance(si, cos, active)
         if request.base is not None and self.base is not None:
             reflected += (1 - reflected) * self.base.albedo(si, active)
-        front = self.coat.reflectance(cos)
+        front = dr.mean(self.coat.reflectance(si, cos))
         return dr.detach(dr.clip(front / (front + dr.square(1 - front) * dr.mean(reflected)), 0, 1))
 
     def albedo(self, si: mi.SurfaceInteraction3f, active: mi.Bool) -> mi.UnpolarizedSpectrum:
@@ -140,17 +140,23 @@ class Layers:
         active &= cos > 0
         reflected = self.grating.reflectance(si, cos, active)
         if self.coat is not None:
-            front = self.coat.reflectance(cos)
+            front = self.coat.reflectance(si, cos)
             reflected = front + dr.square(1 - front) * reflected
         if self.base is not None:
             of_base = mi.unpolarized_spectrum(self.base.bsdf.eval_diffuse_reflectance(si, active))
             reflected += self.grating.transmittance(si, cos, active) * of_base
         return dr.select(active, dr.clip(reflected, 0, 1), 0)
 
-    def _face(self, si: mi.SurfaceInteraction3f) -> mi.Float:
+    def _face_indices(self, si: mi.SurfaceInteraction3f) -> list[mi.Float]:
+        """Return n behind the smooth face relative to that before it, at each wavelength."""
+        if self.coat is not None:
+            return self.coat.etas(si)
+        return [self.interface.at(wavelength).eta for wavelength in si.wavelengths]
+
+    def _face(self, si: mi.SurfaceInteraction3f) -> mi.UnpolarizedSpectrum:
         """Return F of the smooth face."""
-        cos = mi.Frame3f.cos_theta(si.wi)
-        return mi.fresnel(dr.abs(cos), self.interface.eta)[0] if self.coat is None else self.coat.reflectance(cos)
+        cos = dr.abs(mi.Frame3f.cos_theta(si.wi))
+        return mi.UnpolarizedSpectrum([mi.fresnel(cos, eta)[0] for eta in self._face_indices(si)])
 
     def evaluate(
         self,
@@ -207,15 +213,15 @@ class Layers:
 
     def _face_matrix(self, si: mi.SurfaceInteraction3f, ctx: mi.BSDFContext) -> mi.Spectrum:
         """Return the specular reflectance of the smooth face, a Mueller matrix in polarised variants."""
-        value = mi.UnpolarizedSpectrum(self._face(si))
+        value = self._face(si)
         if not mi.is_polarized:
             return value
-        eta = self.interface.eta if self.coat is None else self.coat.eta
+        etas = self._face_indices(si)
 
         def planes(cos_half: mi.Float, reflects: mi.Bool) -> list[mi.Matrix4f]:
-            return [mi.mueller.specular_reflection(dr.abs(cos_half), mi.Complex2f(eta, 0))] * len(value)
+            return [mi.mueller.specular_reflection(dr.abs(cos_half), mi.Complex2f(eta, 0)) for eta in etas]
 
-        split = of_facets(value, planes, eta)
+        split = of_facets(value, planes, etas[0])
         return reflected(split, si.wi, mi.reflect(si.wi), ctx.mode)
 
     def _sample_below(

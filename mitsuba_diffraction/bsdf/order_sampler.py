@@ -21,10 +21,11 @@ from numpy.typing import NDArray
 from scipy.ndimage import map_coordinates
 
 from ..energy.furnace import Furnace
-from ..energy.table import Layout, bounds_of, frequencies_of
+from ..energy.table import Layout, frequencies_of
 from ..geometry import fresnel
 from ..grating_spectrum import GratingSpectrum
 from ..spectrum.grids import OrderGrid
+from ..stack import Stack
 from .geometry import Incidence, cell_of
 from .inversion import direction_bin, direction_borders, search
 from .tables import NumberTable, PacketTable, integer_part, larger, opaque
@@ -58,7 +59,7 @@ class OrderSampler:
     def __init__(
         self,
         spectrum: GratingSpectrum,
-        eta: float | None = None,
+        stack: Stack | None = None,
         is_sheet: bool = False,
         coat_index: float = 1.0,
         height_scales: Sequence[float] = (1.0,),
@@ -68,17 +69,17 @@ class OrderSampler:
 
         Args:
             spectrum: with the wavelengths in the densest medium next to the relief.
-            eta: index below relative to that above; None without transmission.
+            stack: the material with its films; None without transmission.
             is_sheet: whether there is a flat lower face, with the upper medium below it.
             coat_index: of a layer over the relief, relative to the outside.
             height_scales: factors of the heights, ascending; each interval between two of them has its own bins.
             laterals: bounds of the factor of lengths along the surface, by which heights are divided.
         """
         grid = cast(OrderGrid, spectrum.grid)
-        self.transmits, self.is_sheet = eta is not None, is_sheet
-        self.eta, self.coat_index = eta or 1.0, coat_index
-        self.tile, self.max_order = np.array(grid.tile_size), np.array(grid.max_order)
-        first, last = (frequency / coat_index for frequency in frequencies_of(spectrum, eta, laterals))
+        self.transmits, self.is_sheet, self.stack = stack is not None, is_sheet, stack
+        self.eta, self.coat_index = 1.0 if stack is None else stack.nominal, coat_index
+        self.tile, self.max_order, self.laterals = np.array(grid.tile_size), np.array(grid.max_order), laterals
+        first, last = (frequency / coat_index for frequency in frequencies_of(spectrum, self.eta, laterals))
         sides = (True, False) if self.transmits else (True,)
         phase = 4 * np.pi * spectrum.height_range * float(np.mean(height_scales)) * (last - first)
         max_phase = MAX_LINE_PHASE if 0 in grid.max_order else MAX_PHASE
@@ -89,11 +90,15 @@ class OrderSampler:
         side_bins = np.sqrt(entries / (np.sqrt(len(ranges)) * self.slices * orders.prod()))
         self.side_bins = int(np.clip(side_bins, MIN_SIDE_BINS, MAX_SIDE_BINS))
         self.layout = Layout(0.0, 1, self.side_bins, 1, self.slices + 1, (first, last))
+        self.dispersion = 0.0
+        if stack is not None and not is_sheet:
+            indices = stack.below(stack.outside / np.linspace(first, last, 50)).real / stack.outside
+            self.dispersion = 2 * float(np.abs(indices - self.eta).max())
         borders = direction_borders(self.side_bins, 4)
         low, high = borders.min(1), borders.max(1)
         sums, bins, fractions, start = [], [], [], 0
         for scales, above in itertools.product(ranges, sides):
-            furnaces = [Furnace.of(spectrum, scale, eta, 1 if above else -1) for scale in scales]
+            furnaces = [Furnace.of(spectrum, scale, stack, 1 if above else -1) for scale in scales]
             powers_of_sides = []
             for reflects in sides:
                 index = self._indices(above)[0] if reflects else abs(self.eta - 1)
@@ -112,8 +117,9 @@ class OrderSampler:
                 continue
             # With E at the central wavelength.
             omega, wavelengths = self._nodes(self.slices / 2)
-            albedo = furnaces[0].albedo(self._inside(omega, above), wavelengths / self._indices(above)[0])
-            reflected, transmitted = np.array(powers_of_sides) * bounds_of(albedo, furnaces[0].index)
+            furnace, inside = self._at(furnaces[0], above, wavelengths)
+            bounds = furnace.bounds(self._inside(omega, above, inside), wavelengths / inside)
+            reflected, transmitted = np.array(powers_of_sides) * bounds
             fraction = (transmitted / np.maximum(reflected + transmitted, 1e-30)).reshape(self.side_bins + 1, -1)
             middles = (np.indices((FRACTION_SIDE_BINS, FRACTION_SIDE_BINS)) + 0.5) * (
                 self.side_bins / FRACTION_SIDE_BINS
@@ -127,9 +133,15 @@ class OrderSampler:
         self.edges = [opaque(scale) for scale in height_scales[1:-1]]
         self.first, self.per_slice = opaque(first), opaque(self.slices / (last - first))
 
-    def _indices(self, above: bool) -> tuple[float, float]:
-        """Return n next to the relief and outside, above or below."""
-        return (self.coat_index, 1.0) if above else (self.eta, 1.0 if self.is_sheet else self.eta)
+    def _indices(self, above: bool, eta: float | None = None) -> tuple[float, float]:
+        """Return n next to the relief and outside, above or below; `eta` is the index at a wavelength."""
+        eta = eta or self.eta
+        return (self.coat_index, 1.0) if above else (eta, 1.0 if self.is_sheet else eta)
+
+    def _at(self, furnace: Furnace, above: bool, wavelengths: NDArray[np.float64]) -> tuple[Furnace, float]:
+        """Return the furnace at the wavelength of `wavelengths`, which are equal, and n of the medium of ω_i."""
+        at = furnace.at(float(wavelengths[0]), self.laterals)
+        return at, self.coat_index if above else 1 / (at.index or 1.0)
 
     def _nodes(self, slice_: float) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
         """Return outside directions at the nodes of the square, and λ above in µm, at a coordinate along 1/λ."""
@@ -137,9 +149,9 @@ class OrderSampler:
         nodes[:, 0] = slice_
         return self.layout.directions(nodes)
 
-    def _inside(self, omega: NDArray[np.float64], above: bool) -> NDArray[np.float64]:
-        """Return the directions next to the relief from those outside."""
-        inside, outside = self._indices(above)
+    def _inside(self, omega: NDArray[np.float64], above: bool, inside: float) -> NDArray[np.float64]:
+        """Return the directions next to the relief, in the index `inside`, from those outside."""
+        outside = self._indices(above, inside)[1]
         tangent = omega[:, :2] * (outside / inside)
         return np.column_stack([tangent, np.sqrt(np.maximum(1 - (tangent**2).sum(-1), 1e-12))])
 
@@ -147,13 +159,15 @@ class OrderSampler:
         self, furnaces: Sequence[Furnace], above: bool, reflects: bool, slice_: float
     ) -> NDArray[np.floating]:
         """Return p_m² at the nodes of directions, averaged over scales of heights: (rows, columns, orders, orders)."""
-        (inside, outside), (relief, outgoing) = self._indices(above), self._indices(above == reflects)
         omega, wavelengths = self._nodes(slice_)
         result = np.zeros((len(omega), *(2 * self.max_order[::-1] + 1)), np.float32)
         for furnace in furnaces:
             powers = np.zeros_like(result)
+            furnace, inside = self._at(furnace, above, wavelengths)
+            eta = (furnace.index or 1.0) ** (1 if above else -1)
+            outside, (relief, outgoing) = self._indices(above, eta)[1], self._indices(above == reflects, eta)
             for way in furnace.branches[:1] if reflects else furnace.branches[1:]:
-                node, component, power = furnace.terms(self._inside(omega, above), wavelengths / inside, way)
+                node, component, power = furnace.terms(self._inside(omega, above, inside), wavelengths / inside, way)
                 m = np.rint((way or 1) * furnace.q[component] * self.tile).astype(np.int64)
                 tangent = outside * omega[node, :2] + wavelengths[node, None] * m / self.tile
                 square = outgoing**2 - (tangent**2).sum(-1)
@@ -176,7 +190,7 @@ class OrderSampler:
         per_wavelength = self.tile / wavelengths[:, None]
         # With a margin for curved borders and for an index that changes by `MAX_INDEX_CHANGE`.
         half = self._indices(above == reflects)[1] * per_wavelength + 1e-3
-        half += (1e-3 + 2 * MAX_INDEX_CHANGE * max(self.eta, 1)) * per_wavelength.max()
+        half += (1e-3 + 2 * MAX_INDEX_CHANGE * max(self.eta, 1) + self.dispersion) * per_wavelength.max()
         first, last = (
             -self._indices(above)[1] * omega[:, None] * per_wavelength + sign * half
             for omega, sign in ((high, -1), (low, 1))

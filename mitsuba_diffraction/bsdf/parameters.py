@@ -14,14 +14,16 @@ import numpy as np
 
 from ..errors import RequestError, is_number
 from ..geometry import SHADOWING
+from ..materials import RefractiveIndex, is_file
 from ..precomputation import Spectrum, load_spectrum
 from ..recipe import REQUESTED, Recipe
 from ..rigorous.spectrum import RigorousSpectrum
 from ..settings import FROM_RADIUS, THEORIES, TRANSMISSIONS, VISIBLE, wavelengths_inside
 from ..surface.gratings import PROFILES
 from .base import nested_plugin
-from .coat import SAME_INDEX, Coat, absolute_index, coat_from
-from .fresnel import Conductor, Material, PerfectMirror, reflectance_from
+from .coat import SAME_INDEX, Coat, coat_from
+from .fresnel import Conductor, Material, PerfectMirror, SpectralConductor, reflectance_from
+from .indices import absolute_index, index_from
 from .tables import larger
 from .thin_film import with_film
 from .varying import VaryingNumber, check_texture, numbers_from
@@ -38,6 +40,7 @@ _SCALAR_ONLY = {
     "shadowing": "it is part of the efficiencies; leave it out",
     "thin_film_thickness": "its tables are of bare surfaces; leave it out",
     "thin_film_ior": "its tables are of bare surfaces; leave it out",
+    "thin_film_scale": "its tables are of bare surfaces; leave it out",
 }
 
 
@@ -49,13 +52,16 @@ class Media:
         outside: absolute index of the uppermost medium; one for air and vacuum.
         coat: the layer over the relief.
         transmission: "none", "interface" or "sheet".
-        eta: index of the transparent material relative to the outside; None without transmission.
+        eta: index of the transparent material relative to the outside, in the middle of visible light; None without
+            transmission.
+        densest: the maximum absolute index next to the relief at any visible wavelength.
     """
 
     outside: float
     coat: Coat | None
     transmission: str
     eta: float | None
+    densest: float
 
     @classmethod
     def of(cls, props: mi.Properties) -> Media:
@@ -71,21 +77,32 @@ class Media:
         if kind not in TRANSMISSIONS:
             raise RequestError(f"transmission: got {kind!r}, wanted one of {', '.join(TRANSMISSIONS)}")
         if kind == "none":
-            return cls(outside, coat, kind, None)
-        for name in ("material", "base", "coat_ior"):
+            densest = outside if coat is None else outside * max(coat.relative, _densest(coat.medium, coat.index))
+            return cls(outside, coat, kind, None, densest)
+        for name in ("material", "base", "coat_ior", "eta", "k"):
             if name in props:
                 got = repr(props[name]) if isinstance(props[name], str | float | int) else "a BSDF"
                 raise RequestError(f"{name}: got {got} with transmission={kind}, wanted a dielectric (int_ior) alone")
         # Computed as by `Dielectric`, so that both are equal.
-        eta = absolute_index("int_ior", props.get("int_ior", 1.5)) / exterior
+        medium = index_from("int_ior", props.get("int_ior", 1.5))
+        eta = medium.nominal.real / exterior
         if abs(eta - 1) < SAME_INDEX:
             raise RequestError(f"int_ior: got that of the outside with transmission={kind}, wanted another one")
-        return cls(outside, coat, kind, eta)
+        return cls(outside, coat, kind, eta, outside * max(1.0, eta * _densest(medium, medium.nominal.real)))
 
     @property
     def index(self) -> float:
         """The maximum absolute index next to the relief, by which wavelengths are divided there."""
-        return self.outside * (self.coat.relative if self.coat is not None else max(1.0, self.eta or 1.0))
+        return self.densest
+
+    def with_eta(self, eta: float) -> Media:
+        """Return the media with another relative index of the material."""
+        return replace(self, eta=eta, densest=self.outside * max(1.0, eta))
+
+
+def _densest(medium: RefractiveIndex, nominal: float) -> float:
+    """Return the maximum index of a medium at visible wavelengths relative to its nominal one."""
+    return float(medium(np.linspace(*VISIBLE, 100) * 1e-3).real.max() / nominal)
 
 
 class Scales:
@@ -277,12 +294,21 @@ def settings_from(props: mi.Properties, coat: Coat | None) -> dict[str, Any]:
     """
     found = reflectance_from(props, coat)
     if isinstance(found, Conductor):
-        return {"material": found.material}
+        return {"material": _resolved(props["material"])}
+    if isinstance(found, SpectralConductor):
+        raise RequestError("eta: got spectra with theory=rigorous, wanted the name of a conductor or a file: material")
+    if found.dispersion is not None:
+        return {"material": _resolved(props["int_ior"])}
     if isinstance(found, PerfectMirror):
         raise RequestError("material: got 'none', wanted a real one for theory=rigorous, such as 'Al'")
     # Rounded to the digits of a float32.
     eta = float(np.max(found.eta)) * (1 if coat is None else coat.relative)
     return {"int_ior": float(f"{eta:.6g}")}
+
+
+def _resolved(index: str) -> str:
+    """Return the name of a medium, or the path of the file of an index."""
+    return str(Path(str(mi.file_resolver().resolve(index))).absolute()) if is_file(index) else index
 
 
 def settings_of_medium(media: Media) -> dict[str, Any]:

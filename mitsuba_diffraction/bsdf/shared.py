@@ -16,6 +16,7 @@ from ..precomputation import Spectrum
 from ..rigorous.spectrum import RigorousSpectrum
 from ..settings import VISIBLE
 from ..spectrum.grids import OrderGrid
+from ..stack import Stack
 from .continuum import SplineSpectrum
 from .energy import Energy
 from .order_sampler import OrderSampler
@@ -28,7 +29,7 @@ MAX_RATIOS = 16  # number of these nodes
 SAMPLER_RATIOS = 7  # number of ratios of varying scales; `OrderSampler` has bins for each interval between two
 
 _making = threading.Lock()
-_shared: weakref.WeakValueDictionary[tuple[str, str, float | None], SharedTables] = weakref.WeakValueDictionary()
+_shared: weakref.WeakValueDictionary[tuple[str, str, Stack | None], SharedTables] = weakref.WeakValueDictionary()
 
 
 class SharedTables:
@@ -36,40 +37,41 @@ class SharedTables:
 
     Attributes:
         table: the powers and their sampler; of resolved orders without the sampler, which depends on the scene.
+        stack: the material and its films, if light is transmitted.
         max_scale: the maximum lateral scale for which orders are resolved; None if they overlap without scaling.
     """
 
-    def __init__(self, spectrum: Spectrum, eta: float | None) -> None:
+    def __init__(self, spectrum: Spectrum, stack: Stack | None) -> None:
         self.table: OrderSpectrum | SplineSpectrum | RigorousOrders
         if isinstance(spectrum, RigorousSpectrum):
             self.table = RigorousOrders(spectrum)
         else:
             # Of nearly all transmitted light: 1.5 times that of undiffracted light along the normal, at the shortest
             # visible wavelength.
-            max_kappa = None if eta is None else 3 * np.pi * abs(eta - 1) / (VISIBLE[0] * 1e-3)
+            max_kappa = None if stack is None else 3 * np.pi * abs(stack.nominal - 1) / (VISIBLE[0] * 1e-3)
             kind = OrderSpectrum if isinstance(spectrum.grid, OrderGrid) else SplineSpectrum
             self.table = kind(spectrum, max_kappa)
         self.max_scale: float | None = None
         if isinstance(self.table, OrderSpectrum) and self.table.resolved:
             self.max_scale = self.table.max_scale
-        self._spectrum, self._eta = spectrum, eta
+        self._spectrum, self.stack = spectrum, stack
         self._energy: tuple[tuple, Energy | None] | None = None
         self._drawn: tuple[tuple, OrderSpectrum] | None = None
         self._lock = threading.Lock()
 
     @classmethod
-    def of(cls, spectrum: Spectrum, eta: float | None = None) -> SharedTables:
+    def of(cls, spectrum: Spectrum, stack: Stack | None = None) -> SharedTables:
         """Return the tables that a BSDF with an equal spectrum holds, or else new ones.
 
-        `eta` is the relative index of a transmitting grating.
+        `stack` is the material of a grating that transmits light, with its films.
 
         Mitsuba constructs plugins on several threads: one of them makes the tables while the others wait.
         """
-        key = mi.variant(), spectrum.digest, eta
+        key = mi.variant(), spectrum.digest, stack
         with _making:
             tables = _shared.get(key)
             if tables is None:
-                tables = _shared[key] = cls(spectrum, eta)
+                tables = _shared[key] = cls(spectrum, stack)
             return tables
 
     def scattering(self, scales: Scales, is_sheet: bool, coat_index: float) -> OrderSpectrum | SplineSpectrum:
@@ -82,7 +84,7 @@ class SharedTables:
         key = is_sheet, coat_index, ratios.tolist(), scales.laterals
         with self._lock:
             if self._drawn is None or self._drawn[0] != key:
-                sampler = OrderSampler(cast(GratingSpectrum, self._spectrum), self._eta, *key)
+                sampler = OrderSampler(cast(GratingSpectrum, self._spectrum), self.stack, *key)
                 self._drawn = key, cast(OrderSpectrum, table).drawn_by(sampler)
             return self._drawn[1]
 
@@ -101,9 +103,9 @@ class SharedTables:
         key = np.linspace(low, high, count).tolist(), scales.laterals
         with self._lock:
             if self._energy is None or self._energy[0] != key:
-                if key == ([1.0], (1.0, 1.0)) and self._eta is None:
+                if key == ([1.0], (1.0, 1.0)) and self.stack is None:
                     table = spectrum.energy_table()
                 else:
-                    table = EnergyTable.of(spectrum, key[0], self._eta, key[1])
+                    table = EnergyTable.of(spectrum, key[0], self.stack, key[1])
                 self._energy = key, Energy(table) if table.needed else None
             return self._energy[1]

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import dataclasses
 import functools
 import logging
 from typing import Protocol, cast
@@ -18,7 +17,8 @@ from ..grating_spectrum import GratingSpectrum
 from ..precomputation import Spectrum
 from ..rigorous.spectrum import RigorousSpectrum
 from ..settings import VISIBLE
-from .coat import SAME_INDEX
+from ..stack import Stack
+from .coat import SAME_INDEX, Coat
 from .energy import Coordinates, Energy
 from .fresnel import Material
 from .geometry import Geometry, Incidence, Interface, rotated
@@ -29,6 +29,7 @@ from .rigorous_orders import RigorousOrders
 from .shared import SharedTables
 from .tables import opaque
 
+MAX_FILM_CHANGE = 5e-4  # µm, of a film, up to which a table is reused
 _log = logging.getLogger(__name__)
 
 
@@ -129,6 +130,11 @@ class Theory(Protocol):
         """Return the Mueller matrix of the grating as a function of directions and axes, scaled to `value`."""
 
 
+def _of_coat(coat: Coat | None) -> Interface:
+    """Return the interface below a coat, if there is one, that transmits no light."""
+    return Interface() if coat is None else Interface(coat.eta, dispersions=(coat.dispersion, None))
+
+
 def theory_of(props: mi.Properties, spectrum: Spectrum, request: GratingRequest) -> Theory:
     """Return the theory of a spectrum.
 
@@ -184,7 +190,7 @@ class ScalarTheory(Theory):
             )
         # The longest wavelength grows as the index falls.
         self.spectrum = self.spectrum.up_to(last / index)
-        self.tables = SharedTables.of(self.spectrum, self.media.eta)
+        self.tables = SharedTables.of(self.spectrum, self._stack())
         scales = self.scales
         scales.check(self.spectrum.wavelengths, shortest, self.tables.max_scale)
         self.energy: Energy | None = None
@@ -194,17 +200,29 @@ class ScalarTheory(Theory):
         shortest, longest = self.spectrum.wavelengths
         self.wavelengths, self.light = (shortest * index, longest * index), light
 
+    def _films_changed(self) -> bool:
+        """Return whether films differ from those of the tables by more than `MAX_FILM_CHANGE`."""
+        stack, before = self._stack(), self.tables.stack
+        if stack is None or before is None:
+            return False
+        return stack.max_difference(before) > MAX_FILM_CHANGE
+
+    def _stack(self) -> Stack | None:
+        """Return the material and its films for E and for samplers, if light is transmitted."""
+        return None if self.media.eta is None else self.material.stack(self.media.eta)
+
     def _interface(self) -> Interface:
         """Return the media above and below, and set the sampler of orders for the current scales and index."""
         coat, eta, is_sheet = self.media.coat, self.media.eta, self.media.transmission == "sheet"
         scattering = self.tables.scattering(self.scales, is_sheet, 1.0 if coat is None else coat.relative)
         self.scattering = scattering
         if eta is None:
-            return Interface(1.0 if coat is None else coat.eta)
+            return _of_coat(coat)
         kappas = tuple(opaque(kappa) for kappa in small_kappas(self.spectrum, eta))
         sampler = scattering.sampler
         fraction = sampler.transmitted_fraction if isinstance(sampler, OrderSampler) else None
-        return Interface(1.0, self.material.eta, is_sheet, kappas=kappas, transmitted_fraction=fraction)
+        dispersions = None, self.material.dispersion
+        return Interface(1.0, self.material.eta, is_sheet, False, kappas, fraction, dispersions)
 
     def parameters_changed(self, keys: list[str]) -> None:
         changed = [scale for scale in self.scales if not keys or scale.name in keys]
@@ -221,8 +239,8 @@ class ScalarTheory(Theory):
                 )
             other_index = abs(eta - before) > MAX_INDEX_CHANGE * abs(before - 1)
             if other_index:
-                self.media = dataclasses.replace(self.media, eta=eta)
-        if changed or other_index:
+                self.media = self.media.with_eta(eta)
+        if changed or other_index or self._films_changed():
             self.update()
         else:
             self.interface = self._interface()
@@ -289,7 +307,7 @@ class RigorousTheory(Theory):
         self.material = check_parameters(props, spectrum, coat)
         self.scattering = cast(RigorousOrders, SharedTables.of(spectrum).table)
         if media.eta is None:
-            self.interface = Interface(1.0 if coat is None else coat.eta)
+            self.interface = _of_coat(coat)
         else:
             index, is_sheet = opaque(spectrum.int_ior.real), media.transmission == "sheet"
             self.interface = Interface(1.0, index, is_sheet, rigorous=True)

@@ -1,36 +1,29 @@
-"""A thin film on the relief: zinc sulphide of a hologram, the oxide of anodised titanium.
+"""Thin films on the relief: zinc sulphide of a hologram, the oxide of anodised titanium, the stack of a beetle.
 
-A film of constant thickness d along the normal follows the relief, so that the phase e^{iκh} is the same at both of its
-faces, and interference changes R and T alone. With the indices n_0 of the medium of incidence, n_1 of the film and n_2
-of the material, and s = n_0 sin θ_0 in all media,
-
-    z_j = n_j cos θ_j = √(n_j² − s²),    β = 2π d z_1/λ,    r = (r_01 + r_12 e^{2iβ})/(1 + r_01 r_12 e^{2iβ})
-
-for each polarisation (Airy 1833; Born and Wolf 1999, §1.6.4 and §14.4 for absorbing films). It is computed from the
-admittances y_j = z_j (s) and z_j/n_j² (p), with r_jk = (y_j − y_k)/(y_j + y_k):
-
-    r = (y_1 (y_0 − y_2) u + (y_0 y_2 − y_1²) v)/w,    w = y_1 (y_0 + y_2) u + (y_0 y_2 + y_1²) v,    R = |r|²,
-    t = 2 g y_0 y_1 e^{iβ}/w,    u, v = (1 ± e^{2iβ})/2,    g = 1 (s), n_0/n_2 (p),    T = Re z_2/z_0 |t|²
-
-so that d = 0 and n_1 = n_2 give the bare surface without rounding, and nothing overflows in a strongly absorbing film.
-Indices are n + ik, fields e^{−iωt}. T is that of a material without absorption.
+R and T are those of a plane under the films, by the characteristic matrices of `../stack.py`. One film is evaluated
+without a loop, several by a loop over a table of their indices, whose length is opaque.
 """
 
 from __future__ import annotations
 
+import re
 from dataclasses import dataclass
+from typing import Any
 
 import drjit as dr
 import mitsuba as mi
 import numpy as np
 
+from .. import stack
 from ..errors import RequestError
-from .coat import absolute_index
-from .fresnel import Conductor, Dielectric, Material, PerfectMirror
-from .tables import larger
+from ..materials import RefractiveIndex
+from .fresnel import Material, PerfectMirror
+from .indices import MAX_NODES, Dispersion, index_from, nodes_of
+from .tables import PacketTable, integer_part, larger, limited, opaque
 from .varying import VaryingNumber
 
-MAX_THICKNESS = 2.0  # µm: the fringes of thicker films are narrow in λ
+MAX_THICKNESS = 4.0  # µm in all: the fringes of thicker films are narrow in λ
+MAX_FILMS = 100
 
 
 @dataclass
@@ -39,7 +32,7 @@ class Wave:
 
     Attributes:
         reflected, transmitted: numerators.
-        incident: the common denominator, w.
+        incident: the common denominator, y_0 B + C.
     """
 
     reflected: mi.Complex2f
@@ -47,36 +40,42 @@ class Wave:
     incident: mi.Complex2f
 
 
-def waves(
-    cos: mi.Float, n_0: mi.Float, n_1: mi.Complex2f, n_2: mi.Complex2f, thickness: mi.Float, real: tuple[bool, bool]
-) -> tuple[list[Wave], mi.Float]:
-    """Return the waves of s and p, and Re z_2/z_0.
+@dataclass
+class _Plane:
+    """A plane at one wavelength: the components along it and below it.
 
-    Args:
-        cos: cos θ_0.
-        n_0, n_1, n_2: the indices.
-        thickness: d/λ, λ in a medium of the index one.
-        real: whether z_1 is real, and whether z_2 may be replaced by its real part.
+    Attributes:
+        n_0, n_s: the indices above and below.
+        z_0, z_s: n cos θ in them.
+        square: −(n_0 sin θ_0)², which added to n² gives z².
     """
-    z_0 = n_0 * larger(cos, 1e-6)
-    square = dr.square(z_0) - dr.square(n_0)
-    z_1, z_2 = (_root(n * n + square, is_real) for n, is_real in zip((n_1, n_2), real, strict=True))
-    beta = dr.two_pi * thickness * z_1
-    sin, cos = dr.sincos(beta.real)
-    if real[0]:
-        # Both u and v without their factor e^{iβ}.
-        u, v, across = mi.Complex2f(cos, 0), mi.Complex2f(0, -sin), mi.Complex2f(1, 0)
-    else:
-        across = dr.exp(-beta.imag) * mi.Complex2f(cos, sin)
-        twice = across * across
-        u, v = 0.5 * (1 + twice), 0.5 * (1 - twice)
-    found = []
-    of_s, of_p = (z_0, z_1, z_2, 1), (z_0 / dr.square(n_0), z_1 / (n_1 * n_1), z_2 / (n_2 * n_2), n_0 / n_2)
-    for y_0, y_1, y_2, gain in (of_s, of_p):
-        outer, inner, film = y_0 * y_1 * u, y_1 * y_2 * u, (y_0 * y_2 * v, y_1 * y_1 * v)
-        reflected, incident = outer - inner + (film[0] - film[1]), outer + inner + (film[0] + film[1])
-        found.append(Wave(reflected, 2 * gain * y_0 * y_1 * across, incident))
-    return found, z_2.real / z_0
+
+    n_0: mi.Float
+    n_s: mi.Complex2f
+    z_0: mi.Float
+    z_s: mi.Complex2f
+    square: mi.Float
+
+    @classmethod
+    def of(cls, cos: mi.Float, n_0: mi.Float, n_s: mi.Complex2f, is_real: bool) -> _Plane:
+        """Return the plane at cos θ_0; `is_real`: whether z_s may be replaced by its real part."""
+        z_0 = n_0 * larger(cos, 1e-6)
+        square = dr.square(z_0) - dr.square(n_0)
+        return cls(n_0, n_s, z_0, _root(n_s * n_s + square, is_real), square)
+
+    def fields(self) -> list[tuple[mi.Complex2f, mi.Complex2f]]:
+        """Return (B, C) of s and p at the medium below."""
+        one = mi.Complex2f(1, 0)
+        return [(one, self.z_s), (one, self.z_s / (self.n_s * self.n_s))]
+
+    def waves(self, fields: list[tuple[mi.Complex2f, mi.Complex2f]], across: mi.Complex2f) -> list[Wave]:
+        """Return the waves of s and p from (B, C) at the outermost face and the product of the factors e^{iδ}."""
+        found = []
+        of_s, of_p = (self.z_0, mi.Complex2f(1, 0)), (self.z_0 / dr.square(self.n_0), self.n_0 / self.n_s)
+        for field, (y_0, gain) in zip(fields, (of_s, of_p), strict=True):
+            reflected, incident = stack.reflected_and_incident(field, y_0)
+            found.append(Wave(reflected, 2 * y_0 * gain * across, incident))
+        return found
 
 
 def _root(square: mi.Complex2f, is_real: bool) -> mi.Complex2f:
@@ -87,80 +86,163 @@ def _root(square: mi.Complex2f, is_real: bool) -> mi.Complex2f:
     return dr.sqrt(mi.Complex2f(square.real, square.imag + 1e-10))
 
 
+def _crossed(
+    fields: list[tuple[mi.Complex2f, mi.Complex2f]],
+    across: mi.Complex2f,
+    n: mi.Complex2f,
+    thickness: mi.Float,
+    square: mi.Float,
+    is_real: bool,
+) -> tuple[list[tuple[mi.Complex2f, mi.Complex2f]], mi.Complex2f]:
+    """Return (B, C) of s and p at the outer face of a film, and `across` times its factor.
+
+    Args:
+        fields, across: at its inner face.
+        n: its index.
+        thickness: d/λ, λ in a medium of the index one.
+        square: of `_Plane`.
+        is_real: whether z is real.
+    """
+    z = _root(n * n + square, is_real)
+    delta = dr.two_pi * thickness * z
+    sin, cos = dr.sincos(delta.real)
+    if is_real:
+        # Both u and v without their factor e^{iδ}.
+        u, v = mi.Complex2f(cos, 0), mi.Complex2f(0, -sin)
+    else:
+        factor = dr.exp(-delta.imag) * mi.Complex2f(cos, sin)
+        twice = factor * factor
+        u, v, across = 0.5 * (1 + twice), 0.5 * (1 - twice), across * factor
+    return [stack.crossed(field, y, u, v) for field, y in zip(fields, (z, z / (n * n)), strict=True)], across
+
+
 def with_film(props: mi.Properties, material: Material) -> Material:
-    """Return the material with the film of `thin_film_thickness` and `thin_film_ior`, if there is one.
+    """Return the material with the films of `thin_film_thickness` and `thin_film_ior`, if there are any.
 
     Raises:
         RequestError: if a parameter is wrong, or the material cannot have a film.
     """
     given = [name for name in ("thin_film_thickness", "thin_film_ior") if name in props]
     if not given:
+        if "thin_film_scale" in props:
+            raise RequestError("thin_film_scale: got it alone, wanted thin_film_thickness and thin_film_ior with it")
         return material
     if len(given) == 1:
         raise RequestError(f"{given[0]}: got it alone, wanted thin_film_thickness and thin_film_ior together")
     if isinstance(material, PerfectMirror):
         raise RequestError("thin_film_thickness: got a film on material=none, wanted a dielectric or a conductor")
-    film = _of_index(props["thin_film_ior"], material.outside)
-    return FilmedMaterial(material, film, VaryingNumber(props, "thin_film_thickness", 0.0))
+    iors, thicknesses = props["thin_film_ior"], props["thin_film_thickness"]
+    indices = listed("thin_film_ior", iors) if isinstance(iors, str) else [iors]
+    media = [index_from("thin_film_ior", _number_or_name(ior), absorbing=True) for ior in indices]
+    scale = VaryingNumber(props, "thin_film_scale", 1.0)
+    if len(media) == 1 and not (isinstance(thicknesses, str) and _is_list(thicknesses)):
+        return FilmedMaterial(material, media[0], VaryingNumber(props, "thin_film_thickness", 0.0), scale)
+    if not isinstance(thicknesses, str):
+        given_as = "one number" if not isinstance(thicknesses, mi.Object) else "a texture"
+        raise RequestError(
+            f"thin_film_thickness: got {given_as} for {len(media)} films, wanted a list of as many numbers; "
+            "thin_film_scale is a number or texture by which they are multiplied"
+        )
+    numbers = [_number_or_name(text) for text in listed("thin_film_thickness", thicknesses)]
+    if any(isinstance(number, str) for number in numbers):
+        raise RequestError(f"thin_film_thickness: got {thicknesses!r}, wanted numbers of µm")
+    if len(numbers) != len(media):
+        raise RequestError(
+            f"thin_film_thickness: got {len(numbers)} thicknesses for {len(media)} films (thin_film_ior), wanted one "
+            "for each, from the outside in"
+        )
+    return StackedMaterial(material, media, [float(number) for number in numbers], scale)
 
 
-def _of_index(ior: float | str, outside: float) -> Material:
-    """Return the material of a film, for its index relative to the outside."""
-    try:
-        return Dielectric(absolute_index("thin_film_ior", ior), outside)
-    except RequestError:
-        if not isinstance(ior, str):
-            raise
-    try:
-        return Conductor(ior, outside)
-    except RequestError as error:
-        reason = str(error).partition("; ")[0].replace("material: ", "thin_film_ior: ")
-        raise RequestError(f"{reason}, a number, or a name as for int_ior") from None
+def _is_list(text: str) -> bool:
+    return "," in text or re.search(r"\d\s*[x×]\s*\(", text) is not None
 
 
-class FilmedMaterial(Material):
-    """A dielectric or a conductor under a thin film."""
+def _number_or_name(ior: float | str) -> float | str:
+    if isinstance(ior, str):
+        try:
+            return float(ior)
+        except ValueError:
+            return ior
+    return ior
 
-    def __init__(self, below: Material, film: Material, thickness: VaryingNumber) -> None:
-        self.below, self.film, self.thickness, self.outside = below, film, thickness, below.outside
-        self.transparent, self.eta, self.varies = below.transparent, below.eta, thickness.varies
-        shortest, longest = zip(below.wavelengths, film.wavelengths, strict=True)
-        self.wavelengths = max(shortest), min(longest)
-        self._check()
 
-    def update(self) -> None:
-        self.below.update()
-        self.eta = self.below.eta
-        self.thickness.read()
-        self._check()
+def listed(name: str, text: str) -> list[str]:
+    """Return the entries of a list such as "2.35, 1.38", or with repetitions, "8 x (2.35, 1.38), 2.35".
+
+    Raises:
+        RequestError: if it is none, or has too many entries.
+    """
+    found: list[str] = []
+    rest = text.strip()
+    while rest:
+        repeated = re.match(r"(\d+)\s*[x×]\s*\(([^()]*)\)\s*(?:,|$)", rest)
+        single = re.match(r"([^,()]+)(?:,|$)", rest)
+        match = repeated or single
+        if match is None:
+            raise RequestError(f"{name}: got {text!r}, wanted a list such as '2.35, 1.38' or '8 x (2.35, 1.38), 2.35'")
+        count, entries = (int(match[1]), match[2].split(",")) if repeated else (1, [match[1]])
+        entries = [entry.strip() for entry in entries]
+        if "" in entries or not 0 < count * len(entries) + len(found) <= MAX_FILMS:
+            raise RequestError(f"{name}: got {text!r}, wanted a list of 1 to {MAX_FILMS} entries")
+        found += count * entries
+        rest = rest[match.end() :].strip()
+    if not found or text.rstrip().endswith(","):
+        raise RequestError(f"{name}: got {text!r}, wanted a list of 1 to {MAX_FILMS} entries")
+    return found
+
+
+class _Filmed(Material):
+    """A dielectric or a conductor under films.
+
+    Attributes:
+        below: the material.
+        films: the indices, absolute, from the outside in.
+        scale: the factor of the thicknesses.
+    """
+
+    def __init__(self, below: Material, films: list[RefractiveIndex], scale: VaryingNumber) -> None:
+        self.below, self.films, self.scale, self.outside = below, films, scale, below.outside
+        self.transparent, self.dispersion = below.transparent, below.dispersion
+        grids = [nodes_of(film)[[0, -1]] for film in films if not film.is_constant]
+        shortest, longest = zip(below.wavelengths, *grids, strict=True)
+        self.wavelengths = float(max(shortest)), float(min(longest))
+
+    @property
+    def eta(self) -> Any:  # type: ignore[override]
+        return self.below.eta
+
+    def thicknesses(self) -> tuple[np.ndarray, tuple[float, float]]:
+        """Return the thicknesses of the films in µm, and the bounds of their factor."""
+        raise NotImplementedError
 
     def _check(self) -> None:
-        low, high = self.thickness.values[[0, -1]]
-        if low < 0 or high > MAX_THICKNESS:
+        thicknesses, (low, high) = self.thicknesses()
+        if not np.isfinite(thicknesses).all() or thicknesses.min() < 0 or low < 0:
+            bad = min(float(thicknesses.min()), low)
+            raise RequestError(f"thin_film_thickness: got {bad:.6g}, wanted 0 to {MAX_THICKNESS:g} um")
+        if (total := high * thicknesses.sum()) > MAX_THICKNESS * (1 + 1e-6):
             raise RequestError(
-                f"thin_film_thickness: got {low if low < 0 else high:.6g}, wanted 0 to {MAX_THICKNESS:g} um; a thicker "
-                "layer is a coat (coat_ior)"
+                f"thin_film_thickness: got {total:.6g}, wanted 0 to {MAX_THICKNESS:g} um; a thicker layer is a coat "
+                "(coat_ior)"
             )
-        if not self.thickness.varies:
-            dr.make_opaque(self.thickness.value)
-        # From each medium of incidence light propagates in a film of higher index.
-        indices = [np.max(dr.detach(part.eta)) for part in (self.film, self.below) if part.transparent]
-        self.propagates = self.film.transparent and indices[0] >= max([1.0, *indices[1:]])
+
+    def stack(self, eta: float) -> stack.Stack:
+        thicknesses, scales = self.thicknesses()
+        films = tuple((n, float(d)) for n, d in zip(self.films, thicknesses, strict=True))
+        return stack.Stack(self.outside, self.below.stack(eta).below, films, scales)
 
     def _waves(
         self, si: mi.SurfaceInteraction3f, cos: mi.Float, active: mi.Bool, with_phase: bool
     ) -> list[tuple[list[Wave], mi.Float]]:
-        """Return `waves` of each wavelength; without their phase, total reflection needs no imaginary z_2."""
-        thickness, found = self.thickness.at(si, active) * (self.outside * 1e3), []
-        indices = self.film.index(si, active), self.below.index(si, active)
-        real = self.propagates, self.propagates and self.transparent and not with_phase
-        for wavelength, n_1, n_2 in zip(si.wavelengths, *indices, strict=True):
-            n_0 = mi.Float(1.0)
-            if self.transparent:
-                # Light from below.
-                n_0, n_2 = dr.select(cos < 0, n_2.real, 1), mi.Complex2f(dr.select(cos < 0, 1, n_2.real), 0)
-            found.append(waves(dr.abs(cos), n_0, n_1, n_2, thickness / wavelength, real))
-        return found
+        """Return the waves of each wavelength and Re z_s/z_0; without their phase, total reflection has a real z_s."""
+        raise NotImplementedError
+
+    def _media(self, cos: mi.Float, n_s: mi.Complex2f) -> tuple[mi.Float, mi.Complex2f]:
+        """Return n_0 and n_s, exchanged for light from below."""
+        if not self.transparent:
+            return mi.Float(1.0), n_s
+        return dr.select(cos < 0, n_s.real, 1), mi.Complex2f(dr.select(cos < 0, 1, n_s.real), 0)
 
     def powers(
         self, si: mi.SurfaceInteraction3f, cos_half: mi.Float, active: mi.Bool
@@ -189,7 +271,148 @@ class FilmedMaterial(Material):
 
     def traverse(self, callback: mi.TraversalCallback) -> None:
         self.below.traverse(callback)
+        if self.scale.varies or self.scale.values[0] != 1:
+            self.scale.put(callback)
+
+
+class FilmedMaterial(_Filmed):
+    """A dielectric or a conductor under one thin film, whose thickness may be a texture."""
+
+    def __init__(self, below: Material, film: RefractiveIndex, thickness: VaryingNumber, scale: VaryingNumber) -> None:
+        super().__init__(below, [film], scale)
+        self.thickness, self.varies = thickness, thickness.varies or scale.varies
+        self.film: mi.Float | Dispersion = (
+            opaque(film.nominal.real / self.outside)
+            if film.is_constant and not film.absorbs
+            else Dispersion(film, self.outside)
+        )
+        self.update()
+
+    def update(self) -> None:
+        self.below.update()
+        for number in (self.thickness, self.scale):
+            number.read()
+            if not number.varies:
+                dr.make_opaque(number.value)
+        self._check()
+        # From each medium of incidence light propagates in a film of higher index.
+        values = self.films[0].values.real / self.outside
+        below = float(np.max(dr.detach(self.below.eta))) if self.transparent else 1.0
+        if self.dispersion is not None:
+            below = float(self.below.stack(below).below.values.real.max()) / self.outside
+        self.propagates = not self.films[0].absorbs and values.min() >= max(1.0, below)
+
+    def thicknesses(self) -> tuple[np.ndarray, tuple[float, float]]:
+        low, high = self.thickness.values[[0, -1]]
+        low_scale, high_scale = self.scale.values[[0, -1]]
+        if low < 0 or high <= 0:
+            return np.array([low * low_scale]), (1.0, 1.0)
+        return np.array([high]), (float(low / high * low_scale), float(high_scale))
+
+    def _waves(
+        self, si: mi.SurfaceInteraction3f, cos: mi.Float, active: mi.Bool, with_phase: bool
+    ) -> list[tuple[list[Wave], mi.Float]]:
+        thickness = self.thickness.at(si, active) * (self.outside * 1e3)
+        if self.scale.varies or self.scale.values[0] != 1:
+            thickness *= self.scale.at(si, active)
+        real, found = self.propagates and self.transparent and not with_phase, []
+        for wavelength, n_s in zip(si.wavelengths, self.below.index(si, active), strict=True):
+            n = self.film(wavelength) if isinstance(self.film, Dispersion) else mi.Complex2f(self.film, 0)
+            plane = _Plane.of(dr.abs(cos), *self._media(cos, n_s), real)
+            fields, across = _crossed(
+                plane.fields(), mi.Complex2f(1, 0), n, thickness / wavelength, plane.square, self.propagates
+            )
+            found.append((plane.waves(fields, across), plane.z_s.real / plane.z_0))
+        return found
+
+    def traverse(self, callback: mi.TraversalCallback) -> None:
+        super().traverse(callback)
         self.thickness.put(callback)
 
     def __repr__(self) -> str:
-        return f"{self.below}, under {self.thickness} um of {self.film}"
+        return f"{self.below}, under {self.thickness} um of {self.films[0]}"
+
+
+class StackedMaterial(_Filmed):
+    """A dielectric or a conductor under several thin films."""
+
+    def __init__(
+        self, below: Material, films: list[RefractiveIndex], thicknesses: list[float], scale: VaryingNumber
+    ) -> None:
+        super().__init__(below, films, scale)
+        self.thickness, self.varies, self.count = mi.Float(thicknesses), scale.varies, opaque(len(films))
+        first, last = nodes_of(films[0])[[0, -1]] if not self.films[0].is_constant else (360.0, 830.0)
+        for film in films:
+            if not film.is_constant:
+                own = nodes_of(film)
+                first, last = min(first, own[0]), max(last, own[-1])
+        grid = np.linspace(first, last, min(round(last - first), MAX_NODES) + 1)
+        values = np.stack([film(grid * 1e-3) for film in films]) / self.outside
+        self.table, self.nodes = PacketTable(np.stack([values.real, values.imag], -1), width=2), opaque(len(grid))
+        self.first, self.per_nanometre = opaque(grid[0]), opaque((len(grid) - 1) / (grid[-1] - grid[0]))
+        self.update()
+
+    def update(self) -> None:
+        self.below.update()
+        self.scale.read()
+        if not self.scale.varies:
+            dr.make_opaque(self.scale.value)
+        if dr.width(self.thickness) != len(self.films):
+            raise RequestError(
+                f"thin_film_thickness: got {dr.width(self.thickness)} thicknesses for {len(self.films)} films"
+            )
+        dr.make_opaque(self.thickness)
+        self._check()
+
+    def thicknesses(self) -> tuple[np.ndarray, tuple[float, float]]:
+        low, high = self.scale.values[[0, -1]]
+        return np.array(dr.detach(self.thickness), np.float64), (float(low), float(high))
+
+    def _waves(
+        self, si: mi.SurfaceInteraction3f, cos: mi.Float, active: mi.Bool, with_phase: bool
+    ) -> list[tuple[list[Wave], mi.Float]]:
+        scale, nodes = self.scale.at(si, active) * (self.outside * 1e3), integer_part(self.nodes)
+        planes, starts, fractions, state = [], [], [], []
+        for wavelength, n_s in zip(si.wavelengths, self.below.index(si, active), strict=True):
+            planes.append(_Plane.of(dr.abs(cos), *self._media(cos, n_s), False))
+            x = limited((wavelength - self.first) * self.per_nanometre, 0, self.nodes - 1)
+            node = dr.minimum(integer_part(x), nodes - 2)
+            starts.append(node)
+            fractions.append(x - mi.Float(mi.Int32(node)))
+            (b, c), (d, e) = planes[-1].fields()
+            state += [b, c, d, e, mi.Complex2f(1, 0)]
+        films, from_below = integer_part(self.count), cos < 0
+
+        def body(step: mi.UInt32, *state: mi.Complex2f) -> tuple[Any, ...]:
+            # From the innermost film outwards; from the outermost inwards for light from below.
+            film = dr.select(from_below, step, films - 1 - step) if self.transparent else films - 1 - step
+            thickness, following = scale * dr.gather(mi.Float, self.thickness, film, active), []
+            for channel, (plane, node, fraction) in enumerate(zip(planes, starts, fractions, strict=True)):
+                b, c, d, e, across = state[5 * channel : 5 * channel + 5]
+                at = film * nodes + node
+                n = mi.Complex2f(*dr.lerp(self.table(at, active), self.table(at + 1, active), fraction))
+                depth = thickness / si.wavelengths[channel]
+                (first, second), across = _crossed([(b, c), (d, e)], across, n, depth, plane.square, False)
+                following += [*first, *second, across]
+            return step + 1, *following
+
+        if dr.grad_enabled(self.thickness, scale, *planes):
+            # Dr.Jit cannot differentiate the loop in reverse mode.
+            for step in range(len(self.films)):
+                _, *state = body(mi.UInt32(step), *state)
+        else:
+            _, *state = dr.while_loop((mi.UInt32(0), *state), lambda step, *_: step < films, body)
+        found = []
+        for channel, plane in enumerate(planes):
+            b, c, d, e, across = state[5 * channel : 5 * channel + 5]
+            found.append((plane.waves([(b, c), (d, e)], across), plane.z_s.real / plane.z_0))
+        return found
+
+    def traverse(self, callback: mi.TraversalCallback) -> None:
+        super().traverse(callback)
+        callback.put("thin_film_thickness", self.thickness, mi.ParamFlags.Differentiable)
+
+    def __repr__(self) -> str:
+        thicknesses, _ = self.thicknesses()
+        films = ", ".join(f"{d:.4g} um of {n}" for n, d in zip(self.films, thicknesses, strict=True))
+        return f"{self.below}, under {films}"

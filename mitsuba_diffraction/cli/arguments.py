@@ -69,7 +69,7 @@ def surface_of(text: str) -> tuple[str, dict[str, Value]]:
     for name, equals, value in (item.strip().partition("=") for item in items):
         if not (name and equals and value) or name in values:
             raise RequestError(f"{text}: got {name + equals + value!r}, wanted name=value, each name once")
-        values[name] = _converted(value)
+        values[name] = converted(value)
     return source, values
 
 
@@ -102,7 +102,8 @@ def angles_of(option: str, text: str) -> NDArray[np.float64]:
     return found
 
 
-def _converted(text: str) -> Value:
+def converted(text: str) -> Value:
+    """Return a number, true or false, the absolute path of a file that exists, or the text."""
     for kind in (int, float):
         with suppress(ValueError):
             return kind(text)
@@ -187,7 +188,8 @@ def options_of_scan(context: typer.Context) -> dict[str, object]:
 
 def settings_of(context: typer.Context) -> dict[str, Any]:
     """Return the given options of the spectrum, under their names in `Settings`."""
-    return given_of(context, [field.name for field in fields(Settings)])
+    given = given_of(context, [field.name for field in fields(Settings)])
+    return {name: converted(value) if name == "int_ior" else value for name, value in given.items()}
 
 
 def given_of(context: typer.Context, names: Iterable[str]) -> dict[str, Any]:

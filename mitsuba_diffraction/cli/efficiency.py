@@ -22,6 +22,7 @@ from .arguments import (
     Value,
     angles_of,
     check_suffix,
+    converted,
     is_scan,
     numbers,
     options_of_scan,
@@ -52,7 +53,9 @@ def efficiency(
     material: Annotated[
         str | None, typer.Option(help="a conductor, as Mitsuba names it; default: that of the recipe, or n = 1.5")
     ] = None,
-    int_ior: Annotated[float | None, typer.Option(help="the index of a dielectric instead")] = None,
+    int_ior: Annotated[
+        str | None, typer.Option(help="the index of a dielectric instead: a number, a name such as BK7, or a file")
+    ] = None,
     transmission: Annotated[
         str | None,
         typer.Option(help="none, or transmitted orders, too: interface or sheet; default: that of the recipe, or none"),
@@ -76,7 +79,7 @@ def efficiency(
         raise RequestError(f"{name}: got {options} with a saved spectrum, wanted the recipe or the scan itself")
     settings = Settings() if recipe is None else recipe.settings
     theory, transmission = theory or settings.theory, transmission or settings.transmission
-    index: complex | None = int_ior
+    index: complex | str | None = None if int_ior is None else converted(int_ior)
     if material is None and int_ior is None:
         material, index = settings.material, settings.int_ior
     if csv is not None:

@@ -47,7 +47,9 @@ def precompute(
         typer.Option(help=f"{', '.join(THEORIES)} (for line gratings); default: scalar"),
     ] = None,
     material: Annotated[str | None, typer.Option(help="for rigorous theory: a conductor, as Mitsuba names it")] = None,
-    int_ior: Annotated[float | None, typer.Option(help="for rigorous theory: the index of a dielectric")] = None,
+    int_ior: Annotated[
+        str | None, typer.Option(help="for rigorous theory: the index of a dielectric, a name such as BK7, or a file")
+    ] = None,
     ext_ior: Annotated[float | None, typer.Option(help="for rigorous theory: the index of a coat; default: 1")] = None,
     polarised: Annotated[bool, typer.Option("--polarised", help="for rigorous theory: with Mueller matrices")] = False,
     largest_angle: Annotated[

@@ -18,16 +18,17 @@ with the gain Γ of lobes at the horizon. a is summed over components of S, each
 
 For an interface between media, the reflected and the transmitted fraction of light from one side are
 
-    R(ω_i, λ) = ∫ F K G S(q; κ) Γ dq,    T(ω_i, λ) = ∫ (1 − F) K_t S(q; κ_t) Γ_t dq,    κ_t = 2π (cos θ_i − η cos θ_o)/λ
+    R(ω_i, λ) = ∫ F K G S(q; κ) Γ dq,    T(ω_i, λ) = ∫ F_t K_t G_t S(q; κ_t) Γ_t dq,    κ_t = 2π (cos θ_i − η cos θ_o)/λ
 
-with λ in the medium of ω_i, wave vectors in units of n_i (`geometry.transmitted`), and S(q; −κ) = S(−q; κ). Seen from
-below, the surface has the heights −h. A sheet uses the tables of an interface, as its flat face only removes light.
+with λ in the medium of ω_i, wave vectors in units of n_i, and S(q; −κ) = S(−q; κ). F and F_t are R and T of a plane at
+the half vector, of the films on the relief, if there are any (`stack.py`); F_t = 1 − F without them. Seen from below,
+the surface has the heights −h. A sheet uses the tables of an interface, as its flat face only removes light.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import cache
 from typing import Any
 
@@ -36,13 +37,16 @@ from numpy.polynomial.legendre import leggauss
 from numpy.typing import ArrayLike, NDArray
 from scipy.interpolate import CubicSpline
 
-from ..geometry import Array, fresnel, horizon_gain, k_g, transmitted
+from ..geometry import Array, fresnel, horizon_gain, k_g
 from ..spectrum.grids import OrderGrid
 from ..spectrum.power_spectrum import PowerSpectrum
+from ..stack import Plane, Stack
 
 Real = NDArray[np.float64]
 Indices = NDArray[np.int64]
 
+MAX_E = 1.05
+"""Maximum stored 1/a; e is one where the interpolated value exceeds one, so that its kink lies at a = 1."""
 KAPPA_STEP = 0.1  # radians of the phase of the deepest point between nodes in κ; powers are linear between nodes
 MAX_KAPPAS = 1000  # nodes in κ of an interface, eight of which lie below κ₁
 MAX_BIN_WIDTH = 0.12  # direction cosines at the shortest wavelength
@@ -69,6 +73,9 @@ class Furnace:
         powers: float32 (n, K), at K equidistant κ from 0 to κ_max of the spectrum, for unscaled heights.
         height_scale: the factor of the heights.
         lobe_scale: the factor of the widths of lobes of orders.
+        stack: the dielectric with its films, if light is transmitted.
+        side: 1 if ω is above the surface, −1 if below.
+        planes: R and T of its plane at one wavelength (`at`), one for each thickness; those of a bare surface if empty.
     """
 
     spectrum: PowerSpectrum = field(repr=False)
@@ -79,13 +86,16 @@ class Furnace:
     powers: NDArray[np.float32] = field(repr=False)
     height_scale: float = 1.0
     lobe_scale: float = 1.0
+    stack: Stack | None = None
+    side: int = 1
+    planes: tuple[Plane, ...] = ()
 
     @classmethod
     def of(
         cls,
         spectrum: PowerSpectrum,
         height_scale: float = 1.0,
-        index: float | None = None,
+        stack: Stack | None = None,
         side: int = 1,
         lobe_scale: float = 1.0,
     ) -> Furnace:
@@ -94,11 +104,12 @@ class Furnace:
         Args:
             spectrum: S(q; κ).
             height_scale: the factor of the heights.
-            index: n below relative to n above, if light is transmitted.
+            stack: the dielectric with its films, if light is transmitted.
             side: 1 if ω is above the surface; −1 if below, where the surface has the heights −h and S(−q; κ).
             lobe_scale: the factor of the widths of lobes of orders.
         """
         grid, max_kappa = spectrum.grid, spectrum.max_kappa
+        index = None if stack is None else stack.nominal
         by_order = isinstance(grid, OrderGrid) and (1 in grid.shape or all(lobe.count == 1 for lobe in spectrum.lobes))
         count = max_kappa * spectrum.height_range / KAPPA_STEP
         if index is not None:
@@ -116,15 +127,62 @@ class Furnace:
         kept = powers.max(-1) > 1e-7
         powers = np.ascontiguousarray(np.maximum(powers[kept], 0), np.float32)
         relative_index = None if index is None else float(index) ** side
-        return cls(spectrum, relative_index, by_order, side * q[kept], widths[kept], powers, height_scale, lobe_scale)
+        return cls(
+            spectrum,
+            relative_index,
+            by_order,
+            side * q[kept],
+            widths[kept],
+            powers,
+            height_scale,
+            lobe_scale,
+            stack,
+            side,
+        )
+
+    def at(self, wavelength: float, laterals: tuple[float, float] = (1.0, 1.0), step: float = 0.0) -> Furnace:
+        """Return the components with the index and R and T of a plane at one wavelength, µm in the medium above.
+
+        `laterals` are the bounds of the scale of lengths s, by which the wavelength is divided; `step` as of
+        `Stack.planes`.
+        """
+        if self.stack is None or self.stack.is_plain:
+            return self
+        mean = (laterals[0] + laterals[1]) / 2
+        vacuum = wavelength * mean * self.stack.outside
+        index = self.stack.index(vacuum) ** self.side
+        return replace(self, index=index, planes=tuple(self.stack.planes(vacuum, self.side, laterals, step)))
 
     @property
     def branches(self) -> tuple[int, ...]:
         """0 for reflected light; for an interface also ±1, for transmitted light with that sign of v_z."""
         return (0,) if self.index is None else (0, 1, -1)
 
+    @property
+    def _planes(self) -> tuple[Plane, ...]:
+        index = self.index
+        if self.planes or index is None:
+            return self.planes or (lambda cosine: (np.ones_like(cosine), np.zeros_like(cosine)),)
+
+        def bare(cosine: Real) -> tuple[Real, Real]:
+            reflected = np.mean(fresnel(cosine, index), axis=0)
+            return reflected, 1 - reflected
+
+        return (bare,)
+
+    def bounds(self, directions: Real, wavelengths: Real) -> Real:
+        """Return e of E (`bounds_of`) for the same arguments as `albedo`.
+
+        Where the thickness of films varies, e = 1/max(1, R + T) at the worst thickness, for both R and T.
+        """
+        albedos = self._albedos(directions, wavelengths)
+        if len(albedos) > 1:
+            return 1 / np.maximum(albedos.sum(axis=1).max(axis=0), 1) * np.ones((2, 1))
+        normal = None if self.index is None else float(self._planes[0](np.ones(1))[0][0])
+        return bounds_of(albedos[0], normal)
+
     def albedo(self, directions: Real, wavelengths: Real) -> Real:
-        """Compute a(ω, λ), or R and T of an interface.
+        """Compute a(ω, λ), or R and T of an interface, of films of their mean thickness.
 
         Args:
             directions: ω, (n, 3) unit vectors along the axes of the pattern, with z > 0 away from the surface.
@@ -133,12 +191,19 @@ class Furnace:
         Returns:
             (1, n), or (2, n): R and T.
         """
-        result = np.zeros((len(self.branches[:2]), len(directions)))
+        return self._albedos(directions, wavelengths)[len(self._planes) // 2]
+
+    def _albedos(self, directions: Real, wavelengths: Real) -> Real:
+        """Return `albedo` of each thickness, (planes, 1 or 2, n)."""
+        planes = self._planes
+        result = np.zeros((len(planes), len(self.branches[:2]), len(directions)))
         # Adjacent directions share most of their components.
         for batch in np.array_split(np.arange(len(directions)), 1 + len(directions) * len(self.q) // MAX_PAIRS):
             for branch in self.branches:
-                direction, _, value = self.terms(directions[batch], wavelengths[batch], branch)
-                result[abs(branch), batch] += np.bincount(direction, value, len(batch))
+                direction, _, value, cosine = self._terms(directions[batch], wavelengths[batch], branch)
+                for of_plane, plane in zip(result, planes, strict=True):
+                    factor = plane(cosine)[abs(branch)]
+                    of_plane[abs(branch), batch] += np.bincount(direction, value * factor, len(batch))
         return result
 
     def terms(self, directions: Real, length: Real, branch: int) -> tuple[Indices, Indices, Real]:
@@ -146,6 +211,12 @@ class Furnace:
 
         Component j diffracts light from ω to k_o,∥ = −ω_∥ − λ q_j, or −ω_∥ + λ q_j in branch −1, in units of n_i.
         """
+        i, j, value, cosine = self._terms(directions, length, branch)
+        planes = self._planes
+        return i, j, value * planes[len(planes) // 2](cosine)[abs(branch)]
+
+    def _terms(self, directions: Real, length: Real, branch: int) -> tuple[Indices, Indices, Real, Real]:
+        """Return the `terms` without R or T, and |ω_i·h|."""
         s, cos_i, index = directions[:, :2], np.abs(directions[:, 2]), (branch and self.index) or 1.0
         q, radius = self.q * (branch or 1), np.zeros(len(self.q)) if self.by_order else np.sqrt(3) * self.widths
         middle, mean = s.mean(0), (length.min() + length.max()) / 2
@@ -173,15 +244,15 @@ class Furnace:
             i, j, sigma = np.tile(i, LOBE_POINTS), np.tile(j, LOBE_POINTS), np.tile(sigma, LOBE_POINTS)
         cos_i, length = cos_i[i], length[i]
         mean_cos_i = mean_cosine(cos_i**2, sigma)
-        value = weight * self._factor(mean_cos_i, cos_o, length, length**2 * (q**2).sum(-1)[j], branch)
+        value, cosine = self._factor(mean_cos_i, cos_o, length, length**2 * (q**2).sum(-1)[j], branch)
         # κ of reflected light is that of the pair of directions, κ of transmitted light that of the order.
         kappa = self._kappa(mean_cos_i if branch else cos_i, cos_o if branch else cos_exit, length, branch)
-        return i, j, value * self._power(j, kappa, branch)
+        return i, j, weight * value * self._power(j, kappa, branch), cosine
 
     def _bin_terms(
         self, i: Indices, j: Indices, rho: Real, cos_i: Real, length: Real, branch: int
-    ) -> tuple[Indices, Indices, Real]:
-        """Compute the terms of directions i and bins j, whose centres have sin θ_o = ρ.
+    ) -> tuple[Indices, Indices, Real, Real]:
+        """Compute the `_terms` of directions i and bins j, whose centres have sin θ_o = ρ.
 
         Near the horizon a bin has three terms, at points in cos θ_o, as K G varies with that, over the radial extent
         ρ ± √3 σ.
@@ -198,16 +269,22 @@ class Furnace:
             rho_ = np.tile(rho[chosen], count)
             tangent = square + index**2 * r**2 - r / np.maximum(rho_, 1e-12) * (index**2 * rho_**2 + square - tangent)
             tangent = np.maximum(tangent, 0) + (index * np.tile(sigma[chosen], count)) ** 2
-            value = weight * self._factor(cos_, cos_o, length_, tangent, branch)
-            parts.append((i_, j_, value * self._power(j_, self._kappa(cos_, cos_o, length_, branch), branch)))
-        i, j, value = (np.concatenate(part) for part in zip(*parts, strict=True))
-        return i, j, value
+            value, cosine = self._factor(cos_, cos_o, length_, tangent, branch)
+            value = weight * value * self._power(j_, self._kappa(cos_, cos_o, length_, branch), branch)
+            parts.append((i_, j_, value, cosine))
+        i, j, value, cosine = (np.concatenate(part) for part in zip(*parts, strict=True))
+        return i, j, value, cosine
 
-    def _factor(self, cos_i: Real, cos_o: Real, length: Real, tangent: Real, branch: int) -> NDArray[np.floating]:
-        """Return K G F with the gain, or K_t G_t (1 − F), at |λq|² = `tangent`; F = 1 without a medium below."""
+    def _factor(self, cos_i: Real, cos_o: Real, length: Real, tangent: Real, branch: int) -> tuple[Real, Real]:
+        """Return K G with the gain, or K_t G_t, at |λq|² = `tangent`, and |ω_i·h|."""
         if branch:
+            index = self.index or 1.0
             min_v_z = self._min_kappa / max(self.height_scale, 1e-9) * length / (2 * np.pi)
-            return transmitted(cos_i, cos_o, tangent, self.index or 1.0, min_v_z)
+            k_oz = index * np.asarray(cos_o)
+            square = tangent + (cos_i - k_oz) ** 2
+            cosine = np.abs(square + 1 - index**2) / (2 * np.sqrt(square))
+            value = k_g(cos_i, k_oz, tangent, 1 - index**2, False, min_v_z=np.maximum(min_v_z, 1e-6))
+            return value, np.minimum(cosine, 1)
         square = tangent + (cos_i + cos_o) ** 2
         value = k_g(cos_i, cos_o, tangent)
         if not self.by_order:
@@ -216,7 +293,7 @@ class Furnace:
             mirror = np.flatnonzero(b)
             gain = [horizon_gain(cos[mirror] ** 2 / (2 * width[mirror])) for cos in (cos_i, cos_o)]
             value[mirror] += b[mirror] * (gain[0] * gain[1] - value[mirror])
-        return value if self.index is None else value * np.mean(fresnel(np.sqrt(square) / 2, self.index), axis=0)
+        return value, np.sqrt(square) / 2
 
     def _kappa(self, cos_i: Real, cos_o: Real, length: Real, branch: int) -> Real:
         """Return κ in rad/µm of two directions; zero if v_z of transmitted light lacks the sign of the branch."""
@@ -225,7 +302,8 @@ class Furnace:
 
     @property
     def _min_kappa(self) -> float:
-        return min_kappa(self.spectrum, self.index or 1.0, self.height_scale)
+        nominal = 1.0 if self.stack is None else self.stack.nominal**self.side
+        return min_kappa(self.spectrum, nominal, self.height_scale)
 
     def _power(self, component: Indices, kappa: Real, branch: int) -> Real:
         """Return the powers of components at κ; for transmitted light below κ₁ as `small_kappa`."""
@@ -390,3 +468,27 @@ def _binned(spectrum: PowerSpectrum, kappas: Real, width_factor: float) -> tuple
     centre, square = np.stack(moments[1:3], -1) / moments[0][:, None], np.stack(moments[3:5], -1) / moments[0][:, None]
     widths = np.sqrt(np.maximum(square - centre**2, 0).mean(-1) + moments[5] / moments[0])
     return centre, widths, CubicSpline(knots, powers, axis=1)(kappas)
+
+
+def bounds_of(albedo: Real, normal: float | None) -> Real:
+    """Return e from the albedo of the furnace.
+
+    For reflected light alone e = 1/max(1, a). For an interface, transmitted light has priority over all reflected light
+    except F₀, the reflectance of a plane at normal incidence, since scalar theory transmits even light that steep
+    facets reflect totally:
+
+        e_T = min(1, (1 − min(R, F₀))/T),    e_R = min(1, (1 − e_T T)/R),    e_R R + e_T T = min(1, R + T)
+
+    Args:
+        albedo: (1, n), or R and T (2, n).
+        normal: F₀; None for reflected light alone.
+
+    Returns:
+        Shape of `albedo`; for reflected light alone up to `MAX_E`.
+    """
+    if normal is None:
+        return np.minimum(1 / np.maximum(albedo, 1e-9), MAX_E)
+    r, t = albedo
+    # At most one: e_R is so steep at its kink that larger values would err by more between nodes.
+    e_t = np.minimum(1, (1 - np.minimum(r, normal)) / np.maximum(t, 1e-9))
+    return np.stack([np.minimum(1, (1 - e_t * t) / np.maximum(r, 1e-9)), e_t])

@@ -38,6 +38,7 @@ from __future__ import annotations
 import base64
 import binascii
 import dataclasses
+import itertools
 import zlib
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
@@ -49,14 +50,13 @@ from numpy.typing import NDArray
 from ..errors import RequestError
 from ..spectrum.grids import OrderGrid
 from ..spectrum.power_spectrum import PowerSpectrum
-from .furnace import Furnace, Real
+from ..stack import MAX_PHASE_STEP, Stack
+from .furnace import MAX_E, Furnace, Real
 
-MAX_E = 1.05
-"""Maximum stored 1/a; e is one where the interpolated value exceeds one, so that its kink lies at a = 1."""
 MAX_LINE_NODES = 1.2e5  # nodes of the table of a line grating, about
 MAX_NODES = 100000  # nodes of any other table
 MAX_NODE_COMPONENT_PAIRS = 3e7  # evaluations for a table with one ratio
-SLICES = 16  # nodes of 1/λ
+SLICES, MAX_SLICES = 16, 96  # nodes of 1/λ; more than the minimum where fringes of films are narrow
 MIN_FRACTION = 1e-7  # distance of nodes from whole u and v
 MIN_T = 0.01  # t of nodes at the horizon
 
@@ -113,7 +113,9 @@ class Layout:
         frequencies = frequencies_of(spectrum, furnace.index, laterals)
         if furnace.index is not None or not (isinstance(grid, OrderGrid) and 1 in grid.shape):
             nodes = min(MAX_NODE_COMPONENT_PAIRS / (len(furnace.q) * (1 if furnace.index is None else 6)), MAX_NODES)
-            return cls(0.0, 1, max(int(np.sqrt(nodes / SLICES)) - 1, 8), 1, SLICES, frequencies)
+            phase = 0.0 if furnace.stack is None else furnace.stack.phase(frequencies)
+            slices = int(np.clip(phase / MAX_PHASE_STEP, SLICES, MAX_SLICES))
+            return cls(0.0, 1, max(int(np.sqrt(nodes / slices)) - 1, 8), 1, slices, frequencies)
         turned = grid.shape[1] == 1 and grid.shape[0] > 1
         # In about half of the unit squares 1/λ is in range.
         side = np.sqrt(2 * min(MAX_LINE_NODES, MAX_NODE_COMPONENT_PAIRS / max(len(furnace.q) / 2, 1)))
@@ -200,7 +202,7 @@ class EnergyTable:
         cls,
         spectrum: PowerSpectrum,
         ratios: Sequence[float] = (1.0,),
-        index: float | None = None,
+        stack: Stack | None = None,
         laterals: tuple[float, float] = (1.0, 1.0),
     ) -> EnergyTable:
         """Compute the table of `spectrum`.
@@ -208,17 +210,17 @@ class EnergyTable:
         Args:
             spectrum: S(q; κ); for an interface, of wavelengths in the denser medium.
             ratios: the nodes of h/s, equidistant.
-            index: n below relative to n above, if light is transmitted.
+            stack: the dielectric with its films, if light is transmitted.
             laterals: bounds of s.
         """
-        above_and_below = (1,) if index is None else (1, -1)
-        sides = [Furnace.of(spectrum, max(ratios), index, side, laterals[0]) for side in above_and_below]
+        above_and_below = (1,) if stack is None else (1, -1)
+        sides = [Furnace.of(spectrum, max(ratios), stack, side, laterals[0]) for side in above_and_below]
         layout = Layout.of(sides[0], laterals)
-        e = _bounds(layout, sides, ratios, layout.points(0.0)).reshape(len(ratios), -1, *layout.shape)
+        e = _bounds(layout, sides, ratios, layout.points(0.0), laterals).reshape(len(ratios), -1, *layout.shape)
         # e varies fast where an order is just above the horizon, and in deep reliefs: where it is less at the centre of
         # a grid cell than between the corners, they are lowered by the difference.
         corners = layout.corners()
-        of_centres = _bounds(layout, sides, ratios, layout.points(0.5)).reshape(e[corners[0]].shape)
+        of_centres = _bounds(layout, sides, ratios, layout.points(0.5), laterals).reshape(e[corners[0]].shape)
         excess = np.where(of_centres < 1, np.mean([e[corner] for corner in corners], axis=0) - of_centres, 0)
         lowered = e.copy()
         for corner in corners:
@@ -266,28 +268,38 @@ class EnergyTable:
         return cls(layout, np.frombuffer(content, np.uint8).reshape(1, 1, *layout.shape))
 
 
-def _bounds(layout: Layout, sides: Sequence[Furnace], ratios: Sequence[float], points: Real) -> Real:
+def _bounds(
+    layout: Layout, sides: Sequence[Furnace], ratios: Sequence[float], points: Real, laterals: tuple[float, float]
+) -> Real:
     """Return e at coordinates of nodes or centres of a layout, (ratios, channels, n)."""
-    used, step, grid = np.ones(len(points), bool), 0, sides[0].spectrum.grid
+    used, mirror, grid = np.ones(len(points), bool), 0, sides[0].spectrum.grid
     if layout.lines:
         # u + v = 2cT/λ
         used = np.floor(points[:, 1:]).sum(-1) < 2 * layout.period * layout.frequencies[1]
     elif isinstance(grid, OrderGrid) and 1 in grid.shape:
         # Symmetric along the grooves, as rows and columns are exchanged, in reverse where the grooves are along x.
         _, row, column = points.T
-        step = 1 if grid.shape[0] == 1 else -1
-        used = row <= column if step == 1 else row + column <= layout.side
+        mirror = 1 if grid.shape[0] == 1 else -1
+        used = row <= column if mirror == 1 else row + column <= layout.side
     omega, wavelengths = layout.directions(points[used], float(np.mean(layout.frequencies)))
     e = np.ones((len(ratios), sum(len(side.branches[:2]) for side in sides), len(points)))
-    for k, ratio in enumerate(ratios):
-        bounds = [
-            bounds_of(dataclasses.replace(side, height_scale=ratio).albedo(omega, wavelengths / n), side.index)
-            for side, n in zip(sides, (1.0, sides[0].index or 1.0), strict=False)
-        ]
-        e[k, :, used] = np.concatenate(bounds).T
-    if step:
-        side = len(np.unique(points[:, 1]))
-        mirrored = e.reshape(*e.shape[:2], -1, side, side)[..., ::step, ::step].swapaxes(-1, -2)
+    stack = sides[0].stack
+    if stack is None or stack.is_plain:
+        slices = [np.arange(len(omega))]
+    else:
+        # R and T of films, and the index, are those of each wavelength, of which there are few.
+        slices = [np.flatnonzero(wavelengths == wavelength) for wavelength in np.unique(wavelengths)]
+    step = (layout.frequencies[1] - layout.frequencies[0]) / (2 * max(layout.slices - 1, 1))
+    for (k, ratio), slice_ in itertools.product(enumerate(ratios), slices):
+        bounds = []
+        for side in sides:
+            furnace = dataclasses.replace(side, height_scale=ratio).at(wavelengths[slice_[0]], laterals, step)
+            length = wavelengths[slice_] * (1.0 if side.side > 0 else furnace.index or 1.0)
+            bounds.append(furnace.bounds(omega[slice_], length))
+        e[k, :, np.flatnonzero(used)[slice_]] = np.concatenate(bounds).T
+    if mirror:
+        count = len(np.unique(points[:, 1]))
+        mirrored = e.reshape(*e.shape[:2], -1, count, count)[..., ::mirror, ::mirror].swapaxes(-1, -2)
         e = np.where(used, e, mirrored.reshape(e.shape))
     return e
 
@@ -299,27 +311,3 @@ def frequencies_of(
     # The wavelengths of the spectrum are in the denser medium, and are shorter for s > 1.
     shortest, longest = (w * 1e-3 * max(index or 1, 1) for w in spectrum.wavelengths)
     return min(laterals[0], 1) / longest, min(laterals[1], 1) / shortest
-
-
-def bounds_of(albedo: Real, index: float | None) -> Real:
-    """Return e from the albedo of the furnace.
-
-    For reflected light alone e = 1/max(1, a). For an interface, transmitted light has priority over all reflected light
-    except F₀, the reflectance of a plane at normal incidence, since scalar theory transmits even light that steep
-    facets reflect totally:
-
-        e_T = min(1, (1 − min(R, F₀))/T),    e_R = min(1, (1 − e_T T)/R),    e_R R + e_T T = min(1, R + T)
-
-    Args:
-        albedo: (1, n), or R and T (2, n).
-        index: η; None for reflected light alone.
-
-    Returns:
-        Shape of `albedo`; for reflected light alone up to `MAX_E`.
-    """
-    if index is None:
-        return np.minimum(1 / np.maximum(albedo, 1e-9), MAX_E)
-    r, t = albedo
-    # At most one: e_R is so steep at its kink that larger values would err by more between nodes.
-    e_t = np.minimum(1, (1 - np.minimum(r, ((index - 1) / (index + 1)) ** 2)) / np.maximum(t, 1e-9))
-    return np.stack([np.minimum(1, (1 - e_t * t) / np.maximum(r, 1e-9)), e_t])

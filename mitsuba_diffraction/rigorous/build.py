@@ -21,6 +21,7 @@ from numpy.typing import NDArray
 
 from ..errors import RequestError
 from ..files import whole_file
+from ..materials import index_of, refractive_index
 from ..progress import Progress, silent, stage
 from ..settings import Settings
 from ..surface.heightfield import HeightField
@@ -36,7 +37,6 @@ from .efficiencies import (
     unpolarised,
     wave_numbers,
 )
-from .materials import refractive_index
 from .spectrum import MAX_PERIOD_IN_WAVELENGTHS, Axes, RigorousSpectrum, fractions_at_nodes, interval_bounds, rank
 
 Real = NDArray[np.float64]
@@ -159,7 +159,8 @@ class _Surface:
         self.harmonics = max(self._harmonics(curve, np.array(d) / np.linalg.norm(d)) for d in _HARMONICS_DIRECTIONS)
         # The table uses the first. The others serve light that needs more harmonics, and the checks.
         self.gratings = [Grating(curve, int(1.4**k * self.harmonics)) for k in range(5)]
-        request = height_field.digest, self.wavelengths, self.material, settings.polarised, self.transmission
+        medium = settings.int_ior if settings.material is None else index_of("material", settings.material).digest
+        request = height_field.digest, self.wavelengths, medium, settings.ext_ior, settings.polarised, self.transmission
         self.digest = hashlib.sha256(repr((request, self.harmonics, BUILD_VERSION)).encode()).hexdigest()
 
     def index(self, wavelength: float) -> complex:

@@ -14,9 +14,9 @@ from numpy.typing import ArrayLike, NDArray
 from threadpoolctl import ThreadpoolController
 
 from ..errors import RequestError
+from ..materials import refractive_index
 from ..surface.heightfield import HeightField
 from .coordinate_transformation import ABOVE, BELOW, Curve, Grating, Scattered, curve_of, half_space, scatter
-from .materials import refractive_index
 
 Real = NDArray[np.float64]
 Complex = NDArray[np.complex128]

@@ -14,8 +14,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..errors import RequestError
+from ..materials import conductor
 from ..outputs import MARK
-from ..rigorous.materials import conductor
 from ..settings import FROM_RADIUS, SUN_COHERENCE_LENGTH, VISIBLE
 from ..spectrum.grids import OrderGrid
 from ..spectrum.sample import effective_coherence_length, window_axes
@@ -221,11 +221,9 @@ def _light() -> NDArray[np.float32]:
 
 def _metals(chosen: str) -> dict[str, Any]:
     """Return n + ik of the conductors at each nm, (471, 2), as `Conductor` of the BSDF has them."""
-    folder = Path(str(metadata.distribution("mitsuba").locate_file("mitsuba/data/ior")))
     names = [*METALS, *([chosen] if chosen not in (*METALS, "", "none") else [])]
     found = {}
     for name in names:
-        wavelengths, n, k = conductor(name, folder)
-        index = [np.interp(_nanometres() * 1e-3, wavelengths, part) for part in (n, k)]
-        found[name] = encoded(np.stack(index, -1).astype(np.float32))
+        index = conductor(name)(_nanometres() * 1e-3)
+        found[name] = encoded(np.stack([index.real, index.imag], -1).astype(np.float32))
     return found

@@ -11,10 +11,10 @@ from typing import Any
 
 from ..errors import RequestError, is_number
 from ..grating_spectrum import GratingSpectrum
+from ..materials import refractive_index
 from ..precomputation import Spectrum, load_spectrum
 from ..progress import Progress, no_progress
 from ..recipe import Recipe, parameters_of_profile
-from ..rigorous.materials import refractive_index
 from ..settings import FROM_RADIUS
 from ..spectrum.tables import SliceTable
 from ..surface.gratings import PROFILES

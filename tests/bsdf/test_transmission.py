@@ -14,6 +14,8 @@ import mitsuba_diffraction as md
 from mitsuba_diffraction import testing
 from mitsuba_diffraction.bsdf.geometry import Geometry, Incidence, Interface
 from mitsuba_diffraction.bsdf.order_sampler import OrderSampler
+from mitsuba_diffraction.materials import constant
+from mitsuba_diffraction.stack import Stack
 
 PERIOD, ETA, WAVELENGTH = 3.35, 1.5, 0.5
 IMPORTANCE = mi.TransportMode.Importance
@@ -214,7 +216,7 @@ def test_samples_from_above_have_similar_weights(profile, kind, theta):
 @pytest.mark.parametrize("profile", ["film", "transmission_300"])
 def test_reflected_and_transmitted_orders_are_drawn_with_their_probabilities(profile, theta, is_sheet, above, reflects):
     spectrum = md.precompute(md.gratings.PROFILES[profile](), wavelengths=(240.0, 830.0), tolerance=0.01)
-    table = OrderSampler(spectrum, ETA, is_sheet)
+    table = OrderSampler(spectrum, Stack(1.0, constant(ETA)), is_sheet)
     kappas = mi.Float(1.0), mi.Float(1.0)
     interface = Interface(
         eta=mi.Float(ETA), is_sheet=is_sheet, kappas=kappas, transmitted_fraction=table.transmitted_fraction
