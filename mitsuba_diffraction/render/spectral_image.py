@@ -254,7 +254,7 @@ def _notes(path: str | os.PathLike[str]) -> dict[str, str]:
     """Return what `save_preview` noted in a picture: text chunks of PNG, lines NAME=VALUE of the comment of JPEG."""
     from PIL import Image
 
-    with suppress(OSError, ValueError), Image.open(path) as picture:
+    with suppress(OSError, ValueError, Image.DecompressionBombError), Image.open(path) as picture:
         comment = picture.info.get("comment", b"").decode()
         return {**picture.info, **dict(line.split("=") for line in comment.splitlines()[1:])}
     return {}

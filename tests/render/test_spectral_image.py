@@ -254,3 +254,9 @@ def test_wrong_channels_are_refused(image, tmp_path, wrong):
     with pytest.raises(ValueError, match="channels: got"):
         image.save(tmp_path / "a.exr", **wrong)
     assert list(tmp_path.iterdir()) == []
+
+
+def test_a_picture_too_large_to_be_opened_is_no_preview(tmp_path, monkeypatch):
+    Image.new("L", (9, 9)).save(tmp_path / "a.png")
+    monkeypatch.setattr(Image, "MAX_IMAGE_PIXELS", 9)
+    assert spectral_image.exposure_of_preview(tmp_path / "a.png") is None

@@ -317,6 +317,13 @@ def test_a_picture_that_unpacks_to_too_much_is_refused(tmp_path, refuse, monkeyp
     refuse("scan.png", "too large", height_range=1.0)
 
 
+@pytest.mark.parametrize("side", [10_000, 14_000, 65_535])  # Pillow warns of the first, and raises for the others
+def test_a_header_that_claims_too_many_pixels_is_refused(tmp_path, refuse, side):
+    """The tags of Park Systems are looked for before the picture is read."""
+    Image.fromarray(GREY).save(tmp_path / "scan.tif", tiffinfo={256: side, 257: side})
+    refuse("scan.tif", "too large, wanted at most 89478485 pixels: crop it, or export", height_range=1.0)
+
+
 def test_an_archive_that_unpacks_to_too_much_is_refused(tmp_path, refuse, monkeypatch):
     np.savez_compressed(tmp_path / "scan.npz", heights=np.zeros((100, 100)))
     monkeypatch.setattr("mitsuba_diffraction.surface.readers.pictures.MAX_BYTES", 1000)

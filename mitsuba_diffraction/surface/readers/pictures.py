@@ -71,8 +71,10 @@ _PARK_TAG = 50434  # of a TIFF: heights of Park Systems
 
 def is_park(path: Path) -> bool:
     """Return whether a TIFF holds heights in the tags of Park Systems, beside a picture of them."""
-    with suppress(*DAMAGED, ValueError, OSError), Image.open(path, formats=("TIFF",)) as picture:
-        return _PARK_TAG in picture.tag_v2
+    with warnings.catch_warnings(), suppress(*DAMAGED, ValueError, OSError, Image.DecompressionBombError):
+        warnings.simplefilter("ignore")  # `read` refuses what is too large
+        with Image.open(path, formats=("TIFF",)) as picture:
+            return _PARK_TAG in picture.tag_v2
     return False
 
 
@@ -91,7 +93,10 @@ def read(path: Path) -> Scan:
         except UnidentifiedImageError:
             raise RequestError("not a PNG or TIFF picture that can be read") from None
         except (Image.DecompressionBombError, Image.DecompressionBombWarning) as error:
-            raise RequestError(f"too large ({error})") from None
+            raise RequestError(
+                f"too large, wanted at most {Image.MAX_IMAGE_PIXELS} pixels: crop it, or export .npy, .gsf or .gwy "
+                f"({error})"
+            ) from None
         except RequestError:
             raise
         except (*DAMAGED, ValueError) as error:
