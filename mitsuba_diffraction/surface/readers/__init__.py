@@ -39,6 +39,8 @@ _WITH_UNIT = {".gsf": gwyddion.read_simple_field, ".xyz": text.read_points, ".as
 # First bytes of a file → the extension by which it is read if its own is unknown.
 _MAGIC = {
     b"GWYP": ".gwy",
+    b"GWYO": ".gwy",
+    b"GWYQ": ".gwy",
     b"Gwyddion Simple Field": ".gsf",
     b"\\*File list": ".spm",
     b"\x93NUMPY": ".npy",
@@ -133,9 +135,8 @@ def read_height_field(
         source = f"{path.name}, {scan.channel}" if scan.channel else path.name
         field = HeightField(heights, pixel_size, source, fill_missing=fill_missing, keep_missing=keep_missing)
         _check_scale(field, levelled=not keep_missing)
-    # Pillow raises OSError for a damaged image, the system for unreadable paths (a folder, permissions);
-    # UnicodeDecodeError comes from a damaged text.
-    except (RequestError, UnicodeDecodeError, OSError, MemoryError) as error:
+    # Pillow raises OSError for a damaged image, the system for unreadable paths (a folder, permissions).
+    except (RequestError, OSError, MemoryError) as error:
         raise RequestError(" ".join(f"{path}: {str(error)[:_MAX_QUOTE]}".split())) from error
     return field
 

@@ -6,6 +6,9 @@ http://gwyddion.net/documentation/user-guide-en/gwyfile-format.html and gsf.html
 An object of a .gwy file is its name, a zero byte, the number of bytes that follow (uint32) and its components; a
 component is its name, a zero byte, a letter for its type, and its value. All numbers are little-endian. Every size is
 checked against the remaining bytes before it is used.
+
+In files of Gwyddion 1.x, which begin with GWYO, a component of a container is the number of its type in GLib (uint32),
+its name, a zero byte, and its value; within other objects it is as above.
 """
 
 from __future__ import annotations
@@ -26,6 +29,7 @@ from .scan import MAX_BYTES, Channel, Scan, choose
 _NUMBERS = {"b": "<B", "c": "<B", "i": "<i", "q": "<q", "d": "<d"}
 _ARRAYS = {"C": 1, "I": 4, "Q": 8, "D": 8}  # bytes of an element
 _FIELD, _TITLE = re.compile(r"/(\d{1,9})/data"), re.compile(r"/(\d{1,9})/data/title")
+_GLIB_TYPES = {16: "c", 20: "b", 24: "i", 40: "q", 60: "d", 64: "s", 80: "o"}
 _MAX_NAME_LENGTH = 4096
 
 _SIMPLE = b"Gwyddion Simple Field 1.0\n"
@@ -37,14 +41,16 @@ def read(path: Path, unit: str | tuple[str, str] | None, channel: str | int | No
     if path.stat().st_size > MAX_BYTES:
         raise RequestError(f"got {path.stat().st_size} bytes, wanted at most {MAX_BYTES}")
     data = path.read_bytes()
-    if data[:4] != b"GWYP":
-        raise RequestError("not a Gwyddion file, which begins with 'GWYP'")
+    if data[:4] == b"GWYQ":
+        raise RequestError("a Gwyddion file with sizes of 64 bits ('GWYQ'): save it as .gwy of Gwyddion 2, or as .gsf")
+    if data[:4] not in (b"GWYP", b"GWYO"):
+        raise RequestError("not a Gwyddion file, which begins with 'GWYP', or 'GWYO' in version 1")
     name, inside = _Bytes(data, 4, len(data)).content()
     if name != "GwyContainer":
         raise RequestError(f"got a {name!r}, wanted a GwyContainer")
     fields: dict[int, dict[str, Any]] = {}
     titles: dict[int, str] = {}
-    for name, value in inside.components():
+    for name, value in inside.components(glib_types=data[:4] == b"GWYO"):
         if (match := _FIELD.fullmatch(name)) and isinstance(value, tuple) and value[0] == "GwyDataField":
             fields[int(match[1])] = dict(value[1].components())
         elif (match := _TITLE.fullmatch(name)) and isinstance(value, str):
@@ -97,13 +103,17 @@ class _Bytes:
         start = self._skip(size)
         return name, _Bytes(self._data, start, start + size)
 
-    def components(self) -> Iterator[tuple[str, Any]]:
+    def components(self, glib_types: bool = False) -> Iterator[tuple[str, Any]]:
         """Yield name and value of each component: (name, content) of an object, an array of doubles, or None."""
         while self._offset < self._end:
-            yield self._text(_MAX_NAME_LENGTH), self._value()
+            kind = None
+            if glib_types:
+                number = int(self._number("<I"))
+                kind = _GLIB_TYPES.get(number, str(number))
+            name = self._text(_MAX_NAME_LENGTH)
+            yield name, self._value(kind or chr(int(self._number("<B"))))
 
-    def _value(self) -> Any:
-        kind = chr(int(self._number("<B")))
+    def _value(self, kind: str) -> Any:
         if kind == "o":
             return self.content()
         if kind == "s":
@@ -138,7 +148,7 @@ class _Bytes:
         if zero < 0:
             raise RequestError("a text without an end: truncated or damaged")
         start = self._skip(zero + 1 - self._offset)
-        return self._data[start:zero].decode("utf-8")
+        return scan.decoded(self._data[start:zero])
 
 
 def read_simple_field(path: Path, unit: str | tuple[str, str] | None) -> Scan:
@@ -171,7 +181,7 @@ def read_simple_field(path: Path, unit: str | tuple[str, str] | None) -> Scan:
 
 def _fields(header: bytes) -> dict[str, str]:
     fields = {}
-    for line in header.decode("utf-8").splitlines():
+    for line in scan.decoded(header).splitlines():
         name, equals, value = line.partition("=")
         if not equals:
             raise RequestError(f"the header: got the line {line[:60]!r}, wanted 'name = value'")

@@ -60,6 +60,14 @@ def pair(unit: str | tuple[str, str] | None) -> tuple[str, str]:
     return units[0], units[1]
 
 
+def decoded(content: bytes) -> str:
+    """Return a text in UTF-8, or else in Latin-1, which programs on Windows write for µ and °."""
+    try:
+        return content.decode("utf-8-sig")
+    except UnicodeDecodeError:
+        return content.decode("latin-1")
+
+
 MAX_BYTES = 2**31  # of an array read from a file
 # Raised by Pillow and NumPy for damaged files, in addition to OSError and ValueError.
 DAMAGED = (SyntaxError, TypeError, KeyError, EOFError, IndexError, OverflowError, struct.error, UserWarning)

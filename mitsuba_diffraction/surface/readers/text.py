@@ -135,10 +135,7 @@ def _esri(text: str, unit: str | tuple[str, str] | None) -> Scan:
 def _text(path: Path) -> str:
     if path.stat().st_size > MAX_BYTES:
         raise RequestError(f"got {path.stat().st_size} bytes, wanted at most {MAX_BYTES}")
-    try:
-        text = path.read_text(encoding="utf-8-sig")
-    except UnicodeDecodeError:
-        text = path.read_text(encoding="latin-1")  # µ as encoded by Windows
+    text = scan.decoded(path.read_bytes()).replace("\r\n", "\n").replace("\r", "\n")
     if "\0" in text:
         raise RequestError("not a text: it holds zero bytes")
     return text
