@@ -181,6 +181,40 @@ def park(floats=False):
     )
 
 
+def nanoscope(heights, settings=(), image=(), sizes=None):
+    """Nanoscope: a header of text, padded, then the lines of each image, upwards.
+
+    Args:
+        heights: µm.
+        settings, image: fields of the sections of the scan as it was set and of the image.
+        sizes: samples per line and lines of the header, if not those of the heights.
+    """
+    step = 20 / 65536 * 0.1  # µm, of 20 V at 100 nm/V
+    numbers = np.rint(heights[::-1] / step).astype("<i2")
+    samples, lines = sizes or heights.shape[::-1]
+
+    def section(name, **fields):
+        return [f"\\*{name}", *(f"\\{key}: {value}" for key, value in fields.items())]
+
+    start = 4096
+    text = [
+        *section("File list", Version="0x05120000", **{"Start context": "OL", "Data length": start}),
+        *section("Scanner list", **{"@Sens. Zsens": "V 100.0000 nm/V"}),
+        *section("Ciao scan list", **{"Operating mode": "Image"}, **dict(settings)),
+        *section(
+            "Ciao image list",
+            **{"Data offset": start, "Data length": numbers.nbytes, "Bytes/pixel": 2, "Start context": "OL"},
+            **{"Samps/line": samples, "Number of lines": lines},
+            **dict(image),
+            **{"@2:Image Data": 'S [Height] "Height"', "@2:Z scale": "V [Sens. Zsens] (0.0003051758 V/LSB) 20.00000 V"},
+        ),
+        "\\*File list end",
+    ]
+    header = "".join(f"{line}\r\n" for line in text).encode("latin-1") + b"\x1a"
+    assert len(header) < start
+    return header.ljust(start, b"\0") + numbers.tobytes()
+
+
 def gwyddion_text(labels=("Channel:", "Width:", "Height:", "Value units:"), comma=False):
     """The text export of Gwyddion; its header and its decimal mark are those of the language of the program."""
     values = "Topographie", f"{COLUMNS * DX:.3f} µm", f"{ROWS * DY:.3f} µm", "m"

@@ -1,5 +1,8 @@
 """Instruments' files of kinds that SurfaceTopography misreads or refuses, or that need a language."""
 
+import re
+from contextlib import nullcontext
+
 import foreign_scans
 import numpy as np
 import pytest
@@ -41,6 +44,91 @@ LANGUAGES = {
 }
 
 
+# Name → settings of the scan, fields of the image, its columns and lines, its size in µm, and what is in doubt.
+# The layouts of the headers are those of files in the tests and issues of pySPM.
+NANOSCOPE = {
+    "whole.spm": (
+        {"Scan Size": "93000 nm", "Samps/line": 16, "Lines": 16, "Aspect Ratio": "1:1"},
+        {"Aspect Ratio": "1:1", "Scan Size": "93 93 ~m"},
+        (16, 16),
+        (93, 93),
+        None,
+    ),
+    "stopped.spm": (
+        {"Scan Size": "300 nm", "Samps/line": 32, "Lines": 32, "Aspect Ratio": "1:1"},
+        {"Aspect Ratio": "0.516184", "Scan Size": "300 300 nm", "Valid data len X": 32, "Valid data len Y": 22},
+        (32, 22),
+        (0.300, 0.300 * 22 / 32),
+        "Aspect Ratio: 0.516184, .* Number of lines: 22, .* taken as 32 × 22 pixels on 300 × 206.2 nm; pixel_size",
+    ),
+    "two_to_one.spm": (
+        {"Scan Size": "10000 nm", "Samps/line": 32, "Lines": 16, "Aspect Ratio": "2:1"},
+        {"Aspect Ratio": "2:1", "Scan Size": "10 10 ~m"},
+        (32, 16),
+        (10, 5),
+        None,
+    ),
+    "two_to_one_of_a_square.spm": (
+        {"Scan Size": "10000 nm", "Samps/line": 32, "Lines": 32, "Aspect Ratio": "1:1"},
+        {"Aspect Ratio": "2:1", "Scan Size": "10 10 ~m"},
+        (32, 16),
+        (10, 5),
+        None,
+    ),
+    "two_to_one_as_set.spm": (
+        {"Scan Size": "10000 nm", "Samps/line": 32, "Lines": 16, "Aspect Ratio": "2:1"},
+        {"Aspect Ratio": "1:1", "Scan Size": "10 10 ~m"},
+        (32, 16),
+        (10, 5),
+        "Aspect Ratio: 1:1, .* as set: Aspect Ratio: 2:1",
+    ),
+    "two_to_one_in_full.spm": (
+        {"Scan Size": "10000 nm", "Samps/line": 32, "Lines": 16, "Aspect Ratio": "2:1"},
+        {"Aspect Ratio": "2:1", "Scan Size": "10 5 ~m"},
+        (32, 16),
+        (10, 5),
+        None,
+    ),
+    "two_to_one.004": ({}, {"Aspect ratio": "2:1", "Scan size": "10 ~m"}, (32, 16), (10, 5), None),
+    "slow_axis.spm": (
+        {"Scan Size": "10000 nm", "Slow Axis Size": "5000 nm", "Samps/line": 32, "Lines": 16, "Aspect Ratio": "2:1"},
+        {"Aspect Ratio": "2:1", "Scan Size": "10 10 ~m"},
+        (32, 16),
+        (10, 5),
+        None,
+    ),
+    "oblong_pixels.spm": (
+        {"Scan Size": "600 nm", "Samps/line": 32, "Lines": 16, "Aspect Ratio": "1:1"},
+        {"Aspect Ratio": "1:1", "Scan Size": "600 600 nm"},
+        (32, 16),
+        (0.6, 0.6),
+        None,
+    ),
+    "half_of_the_lines.spm": (
+        {"Scan Size": "600 nm", "Samps/line": 32, "Lines": 32, "Aspect Ratio": "1:1"},
+        {"Aspect Ratio": "1:1", "Scan Size": "600 600 nm"},
+        (32, 16),
+        (0.6, 0.6),
+        "taken as 32 × 16 pixels on 600 × 600 nm",
+    ),
+    "enlarged.spm": (
+        {"Scan Size": "600 nm", "Samps/line": 32, "Lines": 32, "Aspect Ratio": "1:1"},
+        {"Aspect Ratio": "1:1", "Scan Size": "300 300 nm"},
+        (16, 16),
+        (0.3, 0.3),
+        None,
+    ),
+    # The image section has the lines of a square, the settings half of those that there are.
+    "sixteen_to_one.001": (
+        {"Scan size": "65000 nm", "Samps/line": 64, "Lines": 2, "Aspect ratio": "16:1"},
+        {"Aspect ratio": "1:1", "Scan size": "65 65 ~m", "Valid data len X": 64, "Valid data len Y": 4},
+        (64, 4),
+        (65, 65 / 16),
+        "Number of lines: 64, Valid data len Y: 4; as set: Aspect Ratio: 16:1, .* taken as 64 × 4 pixels",
+    ),
+}
+
+
 def check(path, missing=()):
     field = read_height_field(path, keep_missing=bool(missing))
     wanted = foreign_scans.relief()
@@ -57,6 +145,40 @@ def test_kinds_that_the_library_misreads_are_read_right(name, tmp_path):
     write, settings = INSTRUMENTS[name]
     (tmp_path / name).write_bytes(write(**settings))
     check(tmp_path / name, settings.get("missing", ()))
+
+
+@needs_the_extra
+@pytest.mark.parametrize("name", NANOSCOPE)
+def test_a_part_of_a_scan_has_its_own_size(name, tmp_path):
+    settings, image, (columns, lines), size, doubt = NANOSCOPE[name]
+    row, column = np.mgrid[:lines, :columns]
+    heights = 0.1 + 0.004 * row + 0.01 * column
+    whole = foreign_scans.nanoscope(heights, settings, image, (64, 64) if columns == 64 else None)
+    (tmp_path / name).write_bytes(whole)
+    with pytest.warns(UserWarning, match=doubt) if doubt else nullcontext():
+        field = read_height_field(tmp_path / name)
+    assert field.shape == (lines, columns)
+    assert field.tile_size == pytest.approx(size)
+    np.testing.assert_allclose(field.heights, heights, atol=2e-5)
+    assert read_height_field(tmp_path / name, pixel_size=0.3).pixel_size == (0.3, 0.3)
+
+
+@needs_the_extra
+@pytest.mark.filterwarnings("ignore:.*disagree")
+@pytest.mark.parametrize("name", ["stopped.spm", "sixteen_to_one.001"])
+def test_a_damaged_header_gives_heights_or_one_line(name, tmp_path):
+    settings, image, (columns, lines), *_ = NANOSCOPE[name]
+    whole = foreign_scans.nanoscope(np.ones((lines, columns)), settings, image)
+    lengths = range(0, len(whole), 97)
+    changed = [re.sub(rb"(?<=: )[^\r]+", new, whole, count=n) for new in (b"", b"-1", b"0", b"x") for n in range(1, 20)]
+    for content in [*(whole[:length] for length in lengths), *changed]:
+        (tmp_path / name).write_bytes(content)
+        message = ""
+        try:
+            read_height_field(tmp_path / name)
+        except ValueError as error:
+            message = str(error)
+        assert "\n" not in message
 
 
 @pytest.mark.parametrize("encoding", ["utf-8", "cp1252"])

@@ -108,7 +108,8 @@ def read_height_field(
             a scan; one line that names the file.
 
     Warns:
-        UserWarning: if the heights are too small or too large for a scan.
+        UserWarning: if the heights are too small or too large for a scan, or if the file contradicts itself about its
+            pixel size.
     """
     path = Path(path)
     refuse_special(path)
@@ -129,6 +130,7 @@ def read_height_field(
                 f"{fraction:.2%} of the pixels are coloured, annotation on a grey picture; they can be "
                 "treated as missing and filled from their surroundings (fill_missing=True, or --fill-missing)"
             )
+        doubt = scan.doubt if pixel_size is None else ""
         pixel_size = scan.pixel_size if pixel_size is None else pixel_size
         if pixel_size is None:
             raise RequestError("pixel_size: the file has none, wanted one number or (x, y) in µm")
@@ -138,6 +140,8 @@ def read_height_field(
     # Pillow raises OSError for a damaged image, the system for unreadable paths (a folder, permissions).
     except (RequestError, OSError, MemoryError) as error:
         raise RequestError(" ".join(f"{path}: {str(error)[:_MAX_QUOTE]}".split())) from error
+    if doubt:
+        warnings.warn(f"{source}: {doubt}; pixel_size (--pixel-size), in µm, sets another scale", stacklevel=2)
     return field
 
 

@@ -56,7 +56,7 @@ def read(path: Path, unit: str | tuple[str, str] | None, channel: str | int | No
         _refuse_bomb(path)
         name = format_of(extension) or ""
         library = lookup_reader_by_format[name]
-        contents = mended.rewritten(path, name)
+        contents, doubts = mended.rewritten(path, name)
         try:
             found = {c.index: c for c in library(contents).channels}
             chosen = choose(
@@ -88,7 +88,7 @@ def read(path: Path, unit: str | tuple[str, str] | None, channel: str | int | No
             along *= factor
     rows, columns = heights.shape
     pixel_size = (size[0] * along / columns, size[1] * along / rows) if size is not None else None
-    return Scan(heights * high, pixel_size, chosen.name)
+    return Scan(heights * high, pixel_size, chosen.name, doubts[chosen.number] if doubts else "")
 
 
 def _refuse_bomb(path: Path) -> None:

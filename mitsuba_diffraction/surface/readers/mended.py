@@ -4,6 +4,7 @@
 - .x3p (ISO 25178-72): a folder that was zipped, heights as text in main.xml, empty offsets, dates that are none, and
   dashes in the revision are common; the library takes none of them.
 - .sur: since 2010 the data may be compressed by zlib (DSCOMPRESSED).
+- .spm, .000: lines and length of a part of a scan (`nanoscope`).
 - .nms: lengths are in nm instead of mm, heights are linear between two integers of the header, and pixels without
   intensity were not measured.
 """
@@ -23,6 +24,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ...errors import RequestError
+from . import nanoscope
 from .scan import MAX_BYTES
 
 _TMD_COMMENT = 24  # bytes, of the only comment that the library reads
@@ -31,17 +33,19 @@ _SUR_AT = 334
 _NMS_HEADER = 3468
 
 
-def rewritten(path: Path, name: str) -> str | io.BytesIO:
-    """Return the path, or the contents, of a file of the format `name` for the library.
+def rewritten(path: Path, name: str) -> tuple[str | io.BytesIO, list[str]]:
+    """Return the path, or the contents, of a file of the format `name` for the library, and `Scan.doubt` by channel.
 
     Raises:
         RequestError: if the file is not of this format.
     """
-    if name not in _REWRITE:
-        return str(path)
+    if name not in (*_REWRITE, "di"):
+        return str(path), []
     if path.stat().st_size > MAX_BYTES:
         raise RequestError(f"got {path.stat().st_size} bytes, wanted at most {MAX_BYTES}")
-    return io.BytesIO(_REWRITE[name](path.read_bytes()))
+    data = path.read_bytes()
+    data, doubts = nanoscope.rewritten(data) if name == "di" else (_REWRITE[name](data), [])
+    return io.BytesIO(data), doubts
 
 
 def _tmd(data: bytes) -> bytes:

@@ -83,11 +83,13 @@ class Scan:
         numbers: (N_y, N_x); floats are µm, NaN or masked where missing; integers use the full range of their type.
         pixel_size: (x, y) in µm; None if the file has none.
         channel: the name of the channel, in formats with several.
+        doubt: how the file contradicts itself about the pixel size, or leaves it in doubt.
     """
 
     numbers: NDArray
     pixel_size: tuple[float, float] | None = None
     channel: str = ""
+    doubt: str = ""
 
 
 @dataclass(frozen=True)
