@@ -181,6 +181,54 @@ def park(floats=False):
     )
 
 
+def jpk(lines=ROWS, image="", curves=0):
+    """JPK: a TIFF whose first page is a preview, with the size of the grid; channels are on further pages, upwards.
+
+    Args:
+        lines: of the grid, of which the image has the first ones.
+        image: name of this TIFF in an archive of force curves; "" for the TIFF itself.
+        curves: bytes of force curves in that archive.
+    """
+    import tifffile
+
+    step, offset = 1e-10, 2e-7  # m, of height = step · number + offset
+    numbers = np.rint((relief()[::-1] * 1e-6 - offset) / step).astype("<i4")
+    first = [
+        (0x8003, "s", 0, "2025-05-20 17:48:42.479 CEST", True),
+        *((0x8042 + i, "d", 1, length * 1e-6, True) for i, length in enumerate((COLUMNS * DX, lines * DY))),
+        (0x8044, "d", 1, 0.0, True),
+        (0x8045, "i", 1, 0, True),
+        (0x8046, "I", 1, COLUMNS, True),
+        (0x8047, "I", 1, lines, True),
+        (0x8052, "s", 0, "contact", True),
+    ]
+    height = [
+        (0x8050, "s", 0, "measuredHeight", True),
+        (0x8051, "i", 1, 0, True),
+        (0x8052, "s", 0, "Height (measured)", True),
+        (0x8080, "i", 1, 2, True),
+        (0x8081, "s", 0, "nominal", True),
+        (0x8090, "s", 0, "raw", True),
+        (0x80C0, "s", 0, "nominal", True),
+        (0x80D2, "s", 0, "m", True),
+        (0x80D3, "s", 0, "LinearScaling", True),
+        (0x80D4, "d", 1, step, True),
+        (0x80D5, "d", 1, offset, True),
+    ]
+    whole = io.BytesIO()
+    with tifffile.TiffWriter(whole) as file:
+        file.write(np.zeros((8, 8), "u1"), extratags=first, metadata=None, photometric="minisblack")
+        file.write(numbers, extratags=height, metadata=None, photometric="minisblack")
+    if not image:
+        return whole.getvalue()
+    archive = io.BytesIO()
+    with zipfile.ZipFile(archive, "w", zipfile.ZIP_DEFLATED) as written:
+        written.writestr("header.properties", "jpk-data-file=spm-quantitative-image-data-file\n")
+        written.writestr("index/0/segments/0/channels/vDeflection.dat", bytes(curves))
+        written.writestr(image, whole.getvalue())
+    return archive.getvalue()
+
+
 def nanoscope(heights, settings=(), image=(), sizes=None):
     """Nanoscope: a header of text, padded, then the lines of each image, upwards.
 

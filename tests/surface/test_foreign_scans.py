@@ -6,10 +6,10 @@ from contextlib import nullcontext
 import foreign_scans
 import numpy as np
 import pytest
-from foreign_scans import COLUMNS, DX, DY, REVISION, ROWS, nms, park, sur, tmd, x3p
+from foreign_scans import COLUMNS, DX, DY, REVISION, ROWS, jpk, nms, park, sur, tmd, x3p
 from test_instrument_files import needs_the_extra
 
-from mitsuba_diffraction.surface.readers import read_height_field
+from mitsuba_diffraction.surface.readers import mended, read_height_field
 
 MISSING = [(7, 11), (7, 12)]
 INSTRUMENTS = {
@@ -29,6 +29,11 @@ INSTRUMENTS = {
     "scan.zip": (x3p, {"missing": MISSING, "folder": "scan/"}),
     "int16.tiff": (park, {}),
     "float.tif": (park, {"floats": True}),
+    "image.jpk": (jpk, {}),
+    "image.jpk-qi-image": (jpk, {}),
+    "image.tif": (jpk, {}),
+    "curves.jpk-qi-data": (jpk, {"image": "data-image.jpk-qi-image"}),
+    "curves.jpk-force-map": (jpk, {"image": "data-image.force"}),
 }
 LANGUAGES = {
     "german.txt": ("Kanal:", "Breite:", "H\u00f6he:", "Werteinheiten:"),
@@ -42,6 +47,36 @@ LANGUAGES = {
         "\u5358\u4f4d\uff1a",
     ),
 }
+
+
+def check(path, missing=()):
+    field = read_height_field(path, keep_missing=bool(missing))
+    wanted = foreign_scans.relief()
+    for at in missing:
+        wanted[at] = np.nan
+    assert field.pixel_size == pytest.approx((DX, DY), rel=1e-6)
+    assert field.shape == (ROWS, COLUMNS)
+    np.testing.assert_allclose(field.heights, wanted, atol=2e-5)
+
+
+@needs_the_extra
+def test_a_jpk_image_of_a_part_of_the_grid_has_its_pixels(tmp_path):
+    (tmp_path / "stopped.jpk").write_bytes(jpk(lines=2 * ROWS))
+    with pytest.warns(UserWarning, match=f"image of {COLUMNS} × {ROWS} pixels, of a grid of {COLUMNS} × {2 * ROWS}"):
+        check(tmp_path / "stopped.jpk")
+
+
+@needs_the_extra
+def test_curves_of_jpk_are_not_unpacked(tmp_path, monkeypatch):
+    (tmp_path / "scan.jpk-qi-data").write_bytes(jpk(image="data-image.jpk-qi-image", curves=300_000))
+    monkeypatch.setattr(mended, "MAX_BYTES", 100_000)
+    check(tmp_path / "scan.jpk-qi-data")
+    monkeypatch.setattr(mended, "MAX_BYTES", 1000)
+    with pytest.raises(ValueError, match=r"got an image of .* wanted at most 1000"):
+        read_height_field(tmp_path / "scan.jpk-qi-data")
+    (tmp_path / "scan.jpk-qi-data").write_bytes(jpk(image="data-image.other"))
+    with pytest.raises(ValueError, match=r"an archive without an image of the heights .* save that image .* as \.jpk"):
+        read_height_field(tmp_path / "scan.jpk-qi-data")
 
 
 # Name → settings of the scan, fields of the image, its columns and lines, its size in µm, and what is in doubt.
@@ -129,16 +164,6 @@ NANOSCOPE = {
 }
 
 
-def check(path, missing=()):
-    field = read_height_field(path, keep_missing=bool(missing))
-    wanted = foreign_scans.relief()
-    for at in missing:
-        wanted[at] = np.nan
-    assert field.pixel_size == pytest.approx((DX, DY), rel=1e-6)
-    assert field.shape == (ROWS, COLUMNS)
-    np.testing.assert_allclose(field.heights, wanted, atol=2e-5)
-
-
 @needs_the_extra
 @pytest.mark.parametrize("name", INSTRUMENTS)
 def test_kinds_that_the_library_misreads_are_read_right(name, tmp_path):
@@ -194,7 +219,16 @@ def test_the_export_of_gwyddion_is_read_in_any_language(name, comma, encoding, t
 
 @needs_the_extra
 @pytest.mark.parametrize(
-    "name", ["no_comment.tmd", "compressed.sur", "heights_as_text.x3p", "en_dash.x3p", "int16.tiff"]
+    "name",
+    [
+        "no_comment.tmd",
+        "compressed.sur",
+        "heights_as_text.x3p",
+        "en_dash.x3p",
+        "int16.tiff",
+        "image.jpk",
+        "curves.jpk-qi-data",
+    ],
 )
 def test_what_is_not_read_is_refused_in_one_line(name, tmp_path):
     write, settings = INSTRUMENTS[name]

@@ -169,8 +169,8 @@ def _read(path: Path, channel: str | int | None, unit: str | tuple[str, str] | N
     known = extension in _EXTENSIONS or instruments.format_of(extension) is not None
     if (not known or extension == ".dat") and path.is_file():  # many programs name their files .dat
         extension = _extension_of_content(path)
-    if extension in (".tif", ".tiff") and pictures.is_park(path):
-        extension = instruments.PARK
+    if extension in (".tif", ".tiff") and (tag := pictures.private_tag(path, instruments.PRIVATE_TIFF)):
+        extension = instruments.PRIVATE_TIFF[tag]
     instrument = instruments.format_of(extension) is not None
     if extension not in _EXTENSIONS and not instrument:
         raise RequestError(

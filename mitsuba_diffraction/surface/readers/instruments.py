@@ -27,16 +27,17 @@ _NAMED_OTHERWISE = (
     {".bcrf": "bcr", ".dat": "metropro", ".nid": "ezd", ".spm": "di"}
     | dict.fromkeys((".vk4", ".vk6", ".vk7"), "vk")
     | dict.fromkeys((".cur", ".stp", ".tom", ".top"), "wsxm")
+    | dict.fromkeys((".jpk-qi-image", ".jpk-qi-data", ".jpk-force-map"), "jpk")
 )
-PARK = ".tiff of Park Systems"
-"""In the place of an extension: a TIFF whose picture is a preview, and whose heights are in tags of their own."""
-FORMATS = {f".{name}": name for name in _NAMED_ALIKE.split()} | _NAMED_OTHERWISE | {PARK: "ps"}
+PRIVATE_TIFF = {50434: ".tiff of Park Systems", 32834: ".jpk"}
+"""Tag of a TIFF whose picture is a preview → what stands for its extension: heights are in tags or on other pages."""
+FORMATS = {f".{name}": name for name in _NAMED_ALIKE.split()} | _NAMED_OTHERWISE | {PRIVATE_TIFF[50434]: "ps"}
 """Extension → SurfaceTopography's name of the format, in addition to Nanoscope's numbers (.000, .001, …)."""
 
 NAMES = (
-    "Nanoscope .spm .000, Nanosurf .nid .ezd, Park .tiff, Igor .ibw, JPK .jpk, NT-MDT .mdt, WSxM .stp .top, "
-    "ISO 25178-71 .sdf, X3P .x3p, Digital Surf .sur, Zygo .dat .datx, Wyko .opd, Keyence .vk4, Sensofar .plu .plux, "
-    "NanoFocus .nms, TrueMap .tmd and others"
+    "Nanoscope .spm .000, Nanosurf .nid .ezd, Park .tiff, Igor .ibw, JPK .jpk .jpk-qi-image .jpk-qi-data, NT-MDT .mdt, "
+    "WSxM .stp .top, ISO 25178-71 .sdf, X3P .x3p, Digital Surf .sur, Zygo .dat .datx, Wyko .opd, Keyence .vk4, "
+    "Sensofar .plu .plux, NanoFocus .nms, TrueMap .tmd and others"
 )
 
 
@@ -53,8 +54,9 @@ def read(path: Path, unit: str | tuple[str, str] | None, channel: str | int | No
             from SurfaceTopography.IO import lookup_reader_by_format
         except ImportError as error:
             raise RequestError(f"an instrument's own format: wanted SurfaceTopography, {EXTRA} ({error})") from None
-        _refuse_bomb(path)
         name = format_of(extension) or ""
+        if name != "jpk":  # of whose archives one member is read
+            _refuse_bomb(path)
         library = lookup_reader_by_format[name]
         contents, doubts = mended.rewritten(path, name)
         try:
@@ -87,8 +89,12 @@ def read(path: Path, unit: str | tuple[str, str] | None, channel: str | int | No
             heights, factor = mended.nms(path, heights)
             along *= factor
     rows, columns = heights.shape
+    doubt = doubts[chosen.number] if doubts else ""
+    if name == "jpk":
+        x, y, doubt = mended.jpk(source.info.get("raw_metadata", {}), heights.shape)
+        size = x * size[0], y * size[1]
     pixel_size = (size[0] * along / columns, size[1] * along / rows) if size is not None else None
-    return Scan(heights * high, pixel_size, chosen.name, doubts[chosen.number] if doubts else "")
+    return Scan(heights * high, pixel_size, chosen.name, doubt)
 
 
 def _refuse_bomb(path: Path) -> None:

@@ -5,6 +5,8 @@
   dashes in the revision are common; the library takes none of them.
 - .sur: since 2010 the data may be compressed by zlib (DSCOMPRESSED).
 - .spm, .000: lines and length of a part of a scan (`nanoscope`).
+- .jpk-qi-data, .jpk-force-map: archives of force curves, with an image of the heights as in a .jpk.
+- .jpk: the size is that of the grid, of which an image may have a part of the lines.
 - .nms: lengths are in nm instead of mm, heights are linear between two integers of the header, and pixels without
   intensity were not measured.
 """
@@ -18,6 +20,7 @@ import zipfile
 import zlib
 from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 from xml.etree import ElementTree
 
 import numpy as np
@@ -31,6 +34,8 @@ _TMD_COMMENT = 24  # bytes, of the only comment that the library reads
 _SUR_HEADER, _SUR_SIZES = 512, struct.Struct("<2h")  # lengths of comment and private data, at `_SUR_AT`
 _SUR_AT = 334
 _NMS_HEADER = 3468
+_JPK_GRID = ("ScanWidth", "ScanLength")  # pixels, by the library's names
+_JPK_IMAGES = ("data-image.jpk-qi-image", "data-image.force")
 
 
 def rewritten(path: Path, name: str) -> tuple[str | io.BytesIO, list[str]]:
@@ -39,6 +44,8 @@ def rewritten(path: Path, name: str) -> tuple[str | io.BytesIO, list[str]]:
     Raises:
         RequestError: if the file is not of this format.
     """
+    if name == "jpk" and zipfile.is_zipfile(path):
+        return io.BytesIO(_jpk_image(path)), []
     if name not in (*_REWRITE, "di"):
         return str(path), []
     if path.stat().st_size > MAX_BYTES:
@@ -46,6 +53,22 @@ def rewritten(path: Path, name: str) -> tuple[str | io.BytesIO, list[str]]:
     data = path.read_bytes()
     data, doubts = nanoscope.rewritten(data) if name == "di" else (_REWRITE[name](data), [])
     return io.BytesIO(data), doubts
+
+
+def _jpk_image(path: Path) -> bytes:
+    try:
+        with zipfile.ZipFile(path) as archive:
+            image = next((member for member in archive.infolist() if member.filename in _JPK_IMAGES), None)
+            if image is None:
+                raise RequestError(
+                    f"an archive without an image of the heights ({' or '.join(_JPK_IMAGES)}): save that image with "
+                    "JPK's program, as .jpk or .jpk-qi-image"
+                )
+            if image.file_size > MAX_BYTES:
+                raise RequestError(f"got an image of {image.file_size} bytes, wanted at most {MAX_BYTES}")
+            return archive.read(image)
+    except (zipfile.BadZipFile, NotImplementedError, RuntimeError, EOFError, zlib.error) as error:
+        raise RequestError(f"a damaged archive ({error})") from None
 
 
 def _tmd(data: bytes) -> bytes:
@@ -119,6 +142,15 @@ def _x3p(data: bytes) -> bytes:
 
 
 _REWRITE: dict[str, Callable[[bytes], bytes]] = {"tmd": _tmd, "sur": _sur, "x3p": _x3p}
+
+
+def jpk(metadata: dict[str, Any], shape: tuple[int, int]) -> tuple[float, float, str]:
+    """Return the part of the grid that an image of JPK covers, along x and y, and `Scan.doubt`."""
+    columns, rows = (int(metadata.get(name, count)) for name, count in zip(_JPK_GRID, shape[::-1], strict=True))
+    if (columns, rows) == shape[::-1] or not (columns > 0 and rows > 0):
+        return 1.0, 1.0, ""
+    part = f"an image of {shape[1]} × {shape[0]} pixels, of a grid of {columns} × {rows}"
+    return shape[1] / columns, shape[0] / rows, f"{part}: taken for a part of the size of the grid"
 
 
 def nms(path: Path, heights: NDArray[np.float64]) -> tuple[NDArray[np.float64], float]:

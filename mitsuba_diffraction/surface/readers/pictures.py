@@ -6,6 +6,7 @@ import tokenize
 import warnings
 import zipfile
 import zlib
+from collections.abc import Iterable
 from contextlib import suppress
 from pathlib import Path
 from typing import IO
@@ -66,16 +67,13 @@ def _load_array(file: IO[bytes]) -> NDArray:
 MAX_ANNOTATION_FRACTION = 0.25  # of pixels that are coloured, such as a scale bar; a colour map has more
 
 
-_PARK_TAG = 50434  # of a TIFF: heights of Park Systems
-
-
-def is_park(path: Path) -> bool:
-    """Return whether a TIFF holds heights in the tags of Park Systems, beside a picture of them."""
+def private_tag(path: Path, tags: Iterable[int]) -> int | None:
+    """Return which of these tags a TIFF has, None if it has none of them."""
     with warnings.catch_warnings(), suppress(*DAMAGED, ValueError, OSError, Image.DecompressionBombError):
         warnings.simplefilter("ignore")  # `read` refuses what is too large
         with Image.open(path, formats=("TIFF",)) as picture:
-            return _PARK_TAG in picture.tag_v2
-    return False
+            return next((tag for tag in tags if tag in picture.tag_v2), None)
+    return None
 
 
 def read(path: Path) -> Scan:
