@@ -181,6 +181,28 @@ def park(floats=False):
     )
 
 
+def ibw(order="<", steps=(DX * 1e-6, DY * 1e-6), units=(b"m", b"m"), layers=0, column_names=(), note=""):
+    """Igor binary wave, version 5: rows are along x, columns along y, upwards; the first index runs fastest.
+
+    Args:
+        order: of bytes.
+        steps: along x and y.
+        units: along the surface, and of the heights, which are in metres.
+        layers: number of images; 0 for a wave of two dimensions.
+        column_names: of the columns.
+        note: lines "name: value".
+    """
+    wave = np.asarray(relief()[::-1].T * 1e-6, f"{order}f4")
+    names = b"".join(name.encode().ljust(32, b"\0") for name in ("", *column_names)) if column_names else b""
+    sizes = 4 * [0], [0, len(names), 0, 0]
+    head = struct.pack(f"{order}hh4i4i4i3i", 5, 0, 320 + wave.nbytes, 0, len(note), 0, *sizes[0], *sizes[1], 0, 0, 0)
+    header = struct.pack(f"{order}3IihhI2xh32siI", 0, 0, 0, wave.size, 2, 0, 0, 1, b"scan", 0, 0)
+    header += struct.pack(f"{order}4i4d4d", COLUMNS, ROWS, layers, 0, *steps, 1, 1, 0, 0, 0, 0)
+    header += struct.pack("4s4s4s8x", units[1], units[0], units[0])
+    assert (len(head), len(header)) == (64, 168)
+    return head + header.ljust(320, b"\0") + max(layers, 1) * wave.tobytes("F") + note.encode() + names
+
+
 def jpk(lines=ROWS, image="", curves=0):
     """JPK: a TIFF whose first page is a preview, with the size of the grid; channels are on further pages, upwards.
 

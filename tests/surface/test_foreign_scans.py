@@ -6,7 +6,7 @@ from contextlib import nullcontext
 import foreign_scans
 import numpy as np
 import pytest
-from foreign_scans import COLUMNS, DX, DY, REVISION, ROWS, jpk, nms, park, sur, tmd, x3p
+from foreign_scans import COLUMNS, DX, DY, REVISION, ROWS, ibw, jpk, nms, park, sur, tmd, x3p
 from test_instrument_files import needs_the_extra
 
 from mitsuba_diffraction.surface.readers import mended, read_height_field
@@ -29,6 +29,9 @@ INSTRUMENTS = {
     "scan.zip": (x3p, {"missing": MISSING, "folder": "scan/"}),
     "int16.tiff": (park, {}),
     "float.tif": (park, {"floats": True}),
+    "image.ibw": (ibw, {}),
+    "big_endian.ibw": (ibw, {"order": ">"}),
+    "layer.ibw": (ibw, {"layers": 1}),
     "image.jpk": (jpk, {}),
     "image.jpk-qi-image": (jpk, {}),
     "image.tif": (jpk, {}),
@@ -57,6 +60,46 @@ def check(path, missing=()):
     assert field.pixel_size == pytest.approx((DX, DY), rel=1e-6)
     assert field.shape == (ROWS, COLUMNS)
     np.testing.assert_allclose(field.heights, wanted, atol=2e-5)
+
+
+@needs_the_extra
+def test_an_igor_wave_without_units_is_read_with_those_given(tmp_path):
+    path = tmp_path / "scan.ibw"
+    path.write_bytes(ibw(units=(b"", b"")))
+    with pytest.raises(ValueError, match="unit: the file names none for its lengths"):
+        read_height_field(path)
+    field = read_height_field(path, unit="m")
+    assert field.pixel_size == pytest.approx((DX, DY))
+    np.testing.assert_allclose(field.heights, foreign_scans.relief(), atol=2e-5)
+    # Igor's own scale is a step of one.
+    path.write_bytes(ibw(units=(b"", b""), steps=(1, 1)))
+    with pytest.raises(ValueError, match="pixel_size: the file has none"):
+        read_height_field(path, unit="m")
+    assert read_height_field(path, (DX, DY), unit="m").shape == (ROWS, COLUMNS)
+    path.write_bytes(ibw(units=(b"m", b"")))
+    with pytest.raises(ValueError, match="unit: the file names none for the heights"):
+        read_height_field(path)
+    np.testing.assert_allclose(read_height_field(path, unit="m").heights, field.heights)
+
+
+@needs_the_extra
+def test_named_columns_of_an_igor_wave_are_curves(tmp_path):
+    (tmp_path / "scan.ibw").write_bytes(ibw(column_names=["Raw", "Deflection", *map(str, range(ROWS - 2))]))
+    with pytest.raises(ValueError, match=r"wanted a channel of heights .* got 0 'Raw', 1 'Deflection'"):
+        read_height_field(tmp_path / "scan.ibw")
+
+
+@needs_the_extra
+def test_an_igor_wave_and_its_note_may_disagree(tmp_path):
+    (tmp_path / "scan.ibw").write_bytes(
+        ibw(note=f"FastScanSize: {COLUMNS * DX * 1e-6}\rSlowScanSize: 2.56e-5\rScanPoints: {COLUMNS}\rScanLines: 64\r")
+    )
+    check(tmp_path / "scan.ibw")  # stopped after a quarter
+    (tmp_path / "scan.ibw").write_bytes(
+        ibw(note=f"FastScanSize: 6e-6\rSlowScanSize: 6e-6\rScanPoints: {COLUMNS}\rScanLines: {ROWS}\r")
+    )
+    with pytest.warns(UserWarning, match="its wave has 6 × 6.4 µm, but its note 6 × 6 µm"):
+        check(tmp_path / "scan.ibw")
 
 
 @needs_the_extra

@@ -73,6 +73,8 @@ def read(path: Path, unit: str | tuple[str, str] | None, channel: str | int | No
                 raise RequestError(f"got {source.nb_grid_pts} pixels, wanted at most {MAX_BYTES} bytes")
             given, own = scan.pair(unit), source.unit or ""
             along, high = (scan.scale(own, one, "its lengths") for one in given)
+            if name == "ibw" and not mended.ibw_has_unit(contents):
+                high = scan.scale("", given[1], "the heights")
             topography = source.topography() if own else source.topography(unit=given[0])
             heights: NDArray[np.float64] = np.ma.asarray(topography.heights(), np.float64).T
             size = topography.physical_sizes
@@ -89,10 +91,14 @@ def read(path: Path, unit: str | tuple[str, str] | None, channel: str | int | No
             heights, factor = mended.nms(path, heights)
             along *= factor
     rows, columns = heights.shape
-    doubt = doubts[chosen.number] if doubts else ""
+    doubt, metadata = doubts[chosen.number] if doubts else "", source.info.get("raw_metadata", {})
+    if not own and size == (columns, rows):
+        size = None  # without a unit these are pixels
     if name == "jpk":
-        x, y, doubt = mended.jpk(source.info.get("raw_metadata", {}), heights.shape)
+        x, y, doubt = mended.jpk(metadata, heights.shape)
         size = x * size[0], y * size[1]
+    if name == "ibw" and size is not None:
+        doubt = mended.ibw(metadata, (along * size[0], along * size[1]), heights.shape)
     pixel_size = (size[0] * along / columns, size[1] * along / rows) if size is not None else None
     return Scan(heights * high, pixel_size, chosen.name, doubt)
 

@@ -4,6 +4,8 @@
 - .x3p (ISO 25178-72): a folder that was zipped, heights as text in main.xml, empty offsets, dates that are none, and
   dashes in the revision are common; the library takes none of them.
 - .sur: since 2010 the data may be compressed by zlib (DSCOMPRESSED).
+- .ibw: a wave of two dimensions is an image, unless its columns have names; the library wants it to be square. Heights
+  may have no unit.
 - .spm, .000: lines and length of a part of a scan (`nanoscope`).
 - .jpk-qi-data, .jpk-force-map: archives of force curves, with an image of the heights as in a .jpk.
 - .jpk: the size is that of the grid, of which an image may have a part of the lines.
@@ -34,6 +36,8 @@ _TMD_COMMENT = 24  # bytes, of the only comment that the library reads
 _SUR_HEADER, _SUR_SIZES = 512, struct.Struct("<2h")  # lengths of comment and private data, at `_SUR_AT`
 _SUR_AT = 334
 _NMS_HEADER = 3468
+_IBW_HEADER = 384
+_IBW_LABELS, _IBW_DIMENSIONS, _IBW_UNIT = 36, 132, 212  # offsets of four int32, of four int32, of a text
 _JPK_GRID = ("ScanWidth", "ScanLength")  # pixels, by the library's names
 _JPK_IMAGES = ("data-image.jpk-qi-image", "data-image.force")
 
@@ -141,7 +145,40 @@ def _x3p(data: bytes) -> bytes:
     return whole.getvalue()
 
 
-_REWRITE: dict[str, Callable[[bytes], bytes]] = {"tmd": _tmd, "sur": _sur, "x3p": _x3p}
+def _ibw(data: bytes) -> bytes:
+    order = "<" if data[:1] == b"\5" else ">"
+    if len(data) < _IBW_HEADER or struct.unpack_from(f"{order}h", data)[0] != 5:
+        return data
+    (columns_named,) = struct.unpack_from(f"{order}4x i", data, _IBW_LABELS)
+    *sides, third, fourth = struct.unpack_from(f"{order}4i", data, _IBW_DIMENSIONS)
+    if min(sides) < 2 or third or fourth or columns_named:
+        return data
+    third = struct.pack(f"{order}i", 1)
+    return data[: _IBW_DIMENSIONS + 8] + third + data[_IBW_DIMENSIONS + 12 :]
+
+
+_REWRITE: dict[str, Callable[[bytes], bytes]] = {"tmd": _tmd, "sur": _sur, "x3p": _x3p, "ibw": _ibw}
+
+
+def ibw_has_unit(contents: str | io.BytesIO) -> bool:
+    """Return whether an Igor wave has a unit of the heights; the library takes that of the surface if it has none."""
+    return not isinstance(contents, io.BytesIO) or contents.getbuffer()[_IBW_UNIT] != 0
+
+
+def ibw(note: dict[str, str], size: tuple[float, float], shape: tuple[int, int]) -> str:
+    """Return `Scan.doubt` of an Igor wave of that size, µm, by the note of an Asylum microscope."""
+    try:
+        set_size = [1e6 * float(note[name]) for name in ("FastScanSize", "SlowScanSize")]
+        counts = [float(note[name]) for name in ("ScanPoints", "ScanLines")]
+        expected = [length * n / count for length, n, count in zip(set_size, shape[::-1], counts, strict=True)]
+    except (KeyError, ValueError, ZeroDivisionError):
+        return ""
+    if np.allclose(size, expected, rtol=0.02):
+        return ""
+    return (
+        f"its wave has {size[0]:.4g} × {size[1]:.4g} µm, but its note {expected[0]:.4g} × {expected[1]:.4g} µm "
+        "(FastScanSize, SlowScanSize, ScanPoints, ScanLines): taken as the wave has it"
+    )
 
 
 def jpk(metadata: dict[str, Any], shape: tuple[int, int]) -> tuple[float, float, str]:
