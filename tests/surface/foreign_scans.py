@@ -285,6 +285,33 @@ def nanoscope(heights, settings=(), image=(), sizes=None):
     return header.ljust(start, b"\0") + numbers.tobytes()
 
 
+def wyko(missing=(), in_nm=False, heights="RAW_DATA", blocks=(), **more):
+    """Wyko ASCII: a line is a column of the picture, upwards; heights in units of Wavelength / Mult, nm."""
+    wavelength, mult = 600.0, 2.0
+    fields = {"Wavelength": wavelength, "Mult": mult, "Pixel_size": DX / 1000, "Aspect": DY / DX, "Title": "A relief"}
+    text = [f"Wyko ASCII Data File Format 0\t{int(in_nm)}\t1", f"X Size\t{COLUMNS}", f"Y Size\t{ROWS}"]
+    text += ["Block Name\tType\tSize\tValue", *(f"{k}\t7\t4\t{v}" for k, v in (fields | more).items() if v is not None)]
+    for name in blocks:
+        text += [f"{name}\t3\t{2 * relief().size}\t", *("\t".join(ROWS * ["128"]) for _ in range(COLUMNS))]
+    numbers = (relief() * 1000 / (1 if in_nm else wavelength / mult))[::-1].T
+    lines = [[f"{number:.6f}" for number in column] for column in numbers]
+    for row, column in missing:
+        lines[column][ROWS - 1 - row] = "Bad"
+    text += [f"{heights}\t3\t{4 * relief().size}\t", *("\t".join(line) for line in lines)]
+    return ("\r\n".join(text) + "\r\n").encode()
+
+
+def zygo(missing=(), resolution=DX, kind="XYZ Data File - Format 1"):
+    """Zygo's XYZ: 13 lines, then pixel numbers and heights in µm; the origin is the upper left corner."""
+    points = [f"{x + 10} {y + 20} {z:.6f}" for (y, x), z in np.ndenumerate(relief())]
+    for row, column in missing:
+        points[row * COLUMNS + column] = f"{column + 10} {row + 20} No Data"
+    text = [f"Zygo {kind}", '0 9 2 0 "Tue Aug 25 16:59:23 2026"', "0 0 0 0 0 0", f"10 20 {COLUMNS} {ROWS}"]
+    text += ['"a comment, # 1"', '""', '""', f"0 0.5 6.328e-07 0.5 1 0 {resolution * 1e-6} 1787677163"]
+    text += ['1200 1200 0 0 1 0 ""', "0 0 1 36 0 1 0 0 0 0", "1 1 100 0 0 0 0 0 0", '0 ""', "1 0.01"]
+    return ("\n".join([*text, "#", *points, "#"]) + "\n").encode()
+
+
 def gwyddion_text(labels=("Channel:", "Width:", "Height:", "Value units:"), comma=False):
     """The text export of Gwyddion; its header and its decimal mark are those of the language of the program."""
     values = "Topographie", f"{COLUMNS * DX:.3f} µm", f"{ROWS * DY:.3f} µm", "m"

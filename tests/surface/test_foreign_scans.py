@@ -6,7 +6,7 @@ from contextlib import nullcontext
 import foreign_scans
 import numpy as np
 import pytest
-from foreign_scans import COLUMNS, DX, DY, REVISION, ROWS, ibw, jpk, nms, park, sur, tmd, x3p
+from foreign_scans import COLUMNS, DX, DY, REVISION, ROWS, ibw, jpk, nms, park, sur, tmd, wyko, x3p, zygo
 from test_instrument_files import needs_the_extra
 
 from mitsuba_diffraction.surface.readers import mended, read_height_field
@@ -38,6 +38,11 @@ INSTRUMENTS = {
     "curves.jpk-qi-data": (jpk, {"image": "data-image.jpk-qi-image"}),
     "curves.jpk-force-map": (jpk, {"image": "data-image.force"}),
 }
+INTERFEROMETERS = {
+    "scan.asc": (wyko, {"missing": MISSING}),
+    "nanometres.txt": (wyko, {"in_nm": True, "blocks": ["Intensity"]}),
+    "opd.asc": (wyko, {"heights": "OPD", "blocks": ["Image", "SecArr_0"]}),
+}
 LANGUAGES = {
     "german.txt": ("Kanal:", "Breite:", "H\u00f6he:", "Werteinheiten:"),
     "english_units.txt": ("Kanal:", "Breite:", "H\u00f6he:", "Value units:"),
@@ -60,6 +65,63 @@ def check(path, missing=()):
     assert field.pixel_size == pytest.approx((DX, DY), rel=1e-6)
     assert field.shape == (ROWS, COLUMNS)
     np.testing.assert_allclose(field.heights, wanted, atol=2e-5)
+
+
+@pytest.mark.parametrize("name", INTERFEROMETERS)
+def test_wyko_ascii_has_its_scale(name, tmp_path):
+    write, settings = INTERFEROMETERS[name]
+    (tmp_path / name).write_bytes(write(**settings))
+    check(tmp_path / name, settings.get("missing", ()))
+    assert read_height_field(tmp_path / name, fill_missing=True).source.startswith(f"{name}, A relief")
+
+
+@pytest.mark.parametrize(
+    ("settings", "message"),
+    [
+        ({"Wavelength": None}, "the header: got 'none' for 'Wavelength', wanted a positive number"),
+        ({"Pixel_size": None}, "pixel_size: the file has none"),
+        ({"Pixel_size": -1}, "the header: got '-1' for 'Pixel_size'"),
+        ({"heights": "Other"}, "without heights, wanted a block RAW_DATA"),
+    ],
+)
+def test_wyko_ascii_without_a_scale_is_refused(settings, message, tmp_path):
+    (tmp_path / "scan.asc").write_bytes(wyko(**settings))
+    with pytest.raises(ValueError, match=message):
+        read_height_field(tmp_path / "scan.asc")
+
+
+def test_zygo_points_are_pixels(tmp_path):
+    path = tmp_path / "scan.xyz"
+    path.write_bytes(zygo(missing=MISSING))
+    field, wanted = read_height_field(path, keep_missing=True), foreign_scans.relief()
+    assert field.gaps.sum() == len(MISSING)
+    assert field.gaps[MISSING[0]]
+    assert field.gaps[MISSING[1]]
+    np.testing.assert_allclose(field.heights[~field.gaps], wanted[~field.gaps], atol=1e-6)
+    assert field.pixel_size == pytest.approx((DX, DX))
+    path.write_bytes(zygo(resolution=0))
+    with pytest.raises(ValueError, match="pixel_size: the file has none"):
+        read_height_field(path)
+    np.testing.assert_allclose(read_height_field(path, 0.5).heights, wanted, atol=1e-6)
+    # Without its header nothing says that these are no lengths.
+    path.write_bytes(zygo().partition(b"#\n")[2])
+    with pytest.warns(UserWarning, match="may be those of pixels: taken for lengths, one pixel is 1 µm"):
+        assert read_height_field(path, unit="um").pixel_size == pytest.approx((1, 1))
+    assert read_height_field(path, 0.5, unit="um").pixel_size == (0.5, 0.5)
+    path.write_bytes(zygo(kind="ASCII Data File - Format 2"))
+    with pytest.raises(ValueError, match="'Zygo ASCII Data File - Format 2', whose heights"):
+        read_height_field(path)
+
+
+@pytest.mark.filterwarnings("ignore:.*whole numbers", "ignore:.*is their unit right")
+@pytest.mark.parametrize(("name", "write"), [("scan.asc", wyko), ("scan.xyz", zygo)])
+def test_a_cut_text_of_an_interferometer_gives_heights_or_one_line(name, write, tmp_path):
+    whole = write(missing=MISSING)
+    for length in range(0, len(whole) - 40, 23):  # the last number may be cut
+        (tmp_path / name).write_bytes(whole[:length])
+        with pytest.raises(ValueError, match=name) as caught:
+            read_height_field(tmp_path / name)
+        assert "\n" not in str(caught.value)
 
 
 @needs_the_extra
@@ -290,7 +352,8 @@ def test_whole_numbers_stand_among_those_with_decimal_commas(mark, tmp_path):
         mark.join((f"{x}", f"{y}", f"{0.1 * x + 0.2 * y:g}".replace(".", ","))) for y in range(3) for x in range(4)
     ]
     (tmp_path / "scan.xyz").write_text("\n".join(lines))
-    field = read_height_field(tmp_path / "scan.xyz", unit="um")
+    with pytest.warns(UserWarning, match="whole numbers, which may be those of pixels"):
+        field = read_height_field(tmp_path / "scan.xyz", unit="um")
     assert field.pixel_size == pytest.approx((1, 1))
     assert np.ptp(field.heights) == pytest.approx(0.7)
     (tmp_path / "both.xyz").write_text("0 0 1,000\n1 0 1.5\n0 1 2\n1 1 2")

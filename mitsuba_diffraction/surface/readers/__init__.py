@@ -19,7 +19,7 @@ from ...errors import RequestError, is_number
 from ...files import refuse_special
 from ...settings import Settings
 from ..heightfield import HeightField
-from . import gwyddion, instruments, pictures, text
+from . import gwyddion, instruments, interferometers, pictures, text
 from .scan import Scan, micrometres, pair
 
 __all__ = ["read_height_field"]
@@ -35,7 +35,13 @@ _WITHOUT_UNIT = {
 """Extension → reader of formats with heights in µm, or scaled by `height_range`."""
 
 # Extension → reader of single-channel formats with a unit.
-_WITH_UNIT = {".gsf": gwyddion.read_simple_field, ".xyz": text.read_points, ".asc": text.read_table}
+_WITH_UNIT = {
+    ".gsf": gwyddion.read_simple_field,
+    ".xyz": text.read_points,
+    ".asc": text.read_table,
+    interferometers.WYKO: interferometers.read_wyko,
+    interferometers.ZYGO: interferometers.read_zygo,
+}
 # First bytes of a file → the extension by which it is read if its own is unknown.
 _MAGIC = {
     b"GWYP": ".gwy",
@@ -52,8 +58,9 @@ _MAGIC = {
     b"DSCOMPRESSED": ".sur",
     b"Binary TrueMap": ".tmd",
     b"PK\3\4": ".x3p",
-}
+} | interferometers.MAGIC
 _EXTENSIONS = (*_WITHOUT_UNIT, ".gwy", *_WITH_UNIT)
+_OF_MANY_PROGRAMS = (".dat", ".asc", ".xyz")
 _HEADER_BYTES = 4096  # of a text
 
 # What a scan that diffracts light can be, µm; outside, a unit is wrong.
@@ -84,6 +91,7 @@ def read_height_field(
     | .gwy, .gsf | Gwyddion, Gwyddion Simple Field | unit, if the file has none |
     | .xyz | points x y z on a regular grid | unit |
     | .asc, .txt | table of heights exported by Gwyddion, or ESRI grid | unit and pixel_size, if it has none |
+    | .asc, .xyz | Wyko ASCII, Zygo XYZ | |
     | .spm, .000, .nid, .ibw, .sdf, .x3p, … | instrument formats, with the extra `instruments` | |
 
     Args:
@@ -167,7 +175,7 @@ def _check_scale(field: HeightField, levelled: bool) -> None:
 def _read(path: Path, channel: str | int | None, unit: str | tuple[str, str] | None) -> Scan:
     extension = path.suffix.lower()
     known = extension in _EXTENSIONS or instruments.format_of(extension) is not None
-    if (not known or extension == ".dat") and path.is_file():  # many programs name their files .dat
+    if (not known or extension in _OF_MANY_PROGRAMS) and path.is_file():
         extension = _extension_of_content(path)
     if extension in (".tif", ".tiff") and (tag := pictures.private_tag(path, instruments.PRIVATE_TIFF)):
         extension = instruments.PRIVATE_TIFF[tag]
@@ -206,7 +214,7 @@ def _extension_of_content(path: Path) -> str:
         start = stream.read(_HEADER_BYTES)
     if text.is_gwyddion_export(start):
         return ".asc"
-    return next((extension for magic, extension in _MAGIC.items() if start.startswith(magic)), path.suffix)
+    return next((extension for magic, extension in _MAGIC.items() if start.startswith(magic)), path.suffix.lower())
 
 
 def _as_micrometres(numbers: NDArray, height_range: float | None) -> NDArray[np.float64]:

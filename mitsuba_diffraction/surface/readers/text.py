@@ -46,10 +46,23 @@ _ESRI = ("ncols", "nrows", "xllcorner", "yllcorner", "xllcenter", "yllcenter", "
 
 def read_points(path: Path, unit: str | tuple[str, str] | None) -> Scan:
     """Read points x y z on a regular grid."""
-    points = _table(_text(path))
+    return _points(table(contents(path)), unit)
+
+
+def _points(points: NDArray[np.float64], unit: str | tuple[str, str] | None) -> Scan:
+    along, high = (scan.scale("", given, "its lengths") for given in scan.pair(unit))
+    heights, (d_x, d_y) = gridded(points)
+    pixel_size = (d_x * along, d_y * along) if d_x and d_y else None  # a single line determines only one of them
+    doubt = ""
+    if np.allclose((d_x, d_y), 1) and (points[:, :2] % 1 == 0).all():
+        doubt = f"x and y are whole numbers, which may be those of pixels: taken for lengths, one pixel is {along:g} µm"
+    return Scan(heights * high, pixel_size, doubt=doubt)
+
+
+def gridded(points: NDArray[np.float64]) -> tuple[NDArray[np.float64], tuple[float, float]]:
+    """Return the heights (N_y, N_x) of points on a regular grid, NaN where there is none, and its spacings."""
     if points.shape[1] != 3:
         raise RequestError(f"got {points.shape[1]} numbers in a line, wanted three: x y z")
-    along, high = (scan.scale("", given, "its lengths") for given in scan.pair(unit))
     if not np.isfinite(points[:, :2]).all():
         raise RequestError("got a point without x or y")
     (column, columns, d_x), (row, rows, d_y) = (_grid(points[:, axis], name) for axis, name in enumerate("xy"))
@@ -60,17 +73,16 @@ def read_points(path: Path, unit: str | tuple[str, str] | None) -> Scan:
         raise RequestError("two points at one position: wanted a regular grid along x and y")
     heights = np.full(rows * columns, np.nan)
     heights[position] = points[:, 2]
-    pixel_size = (d_x * along, d_y * along) if d_x and d_y else None  # a single line determines only one of them
-    return Scan(heights.reshape(rows, columns) * high, pixel_size)
+    return heights.reshape(rows, columns), (d_x, d_y)
 
 
 def read_table(path: Path, unit: str | tuple[str, str] | None) -> Scan:
     """Read a table of heights."""
-    text = _text(path)
+    text = contents(path)
     if text.lstrip()[:5].lower() == "ncols":
         return _esri(text, unit)
     header = _gwyddion_header(text)
-    heights = _table(text)
+    heights = table(text)
     rows, columns = heights.shape
     if not header and columns == 3 and _may_be_points(heights):
         raise RequestError("three numbers a line that may be points x y z: wanted the extension .xyz for points")
@@ -122,7 +134,7 @@ def _esri(text: str, unit: str | tuple[str, str] | None) -> Scan:
     if not {"ncols", "nrows", "cellsize"} <= header.keys():
         raise RequestError(f"the header of an ESRI grid: got {', '.join(header)}, wanted ncols, nrows and cellsize")
     along, high = (scan.scale("", given, "its lengths") for given in scan.pair(unit))
-    heights = _table("\n".join(lines[len(header) :]))
+    heights = table("\n".join(lines[len(header) :]))
     if heights.shape != (header["nrows"], header["ncols"]):
         raise RequestError(
             f"got {heights.shape[0]} lines of {heights.shape[1]}, wanted {header['nrows']:g} of {header['ncols']:g}"
@@ -132,7 +144,8 @@ def _esri(text: str, unit: str | tuple[str, str] | None) -> Scan:
     return Scan(heights[::-1] * high, 2 * (header["cellsize"] * along,))
 
 
-def _text(path: Path) -> str:
+def contents(path: Path) -> str:
+    """Return a text in UTF-8 or Latin-1, whose lines end with \\n."""
     if path.stat().st_size > MAX_BYTES:
         raise RequestError(f"got {path.stat().st_size} bytes, wanted at most {MAX_BYTES}")
     text = scan.decoded(path.read_bytes()).replace("\r\n", "\n").replace("\r", "\n")
@@ -141,7 +154,7 @@ def _text(path: Path) -> str:
     return text
 
 
-def _table(text: str) -> NDArray[np.float64]:
+def table(text: str) -> NDArray[np.float64]:
     """Parse numbers in lines of equal length, separated by white space, commas or semicolons."""
     first = next((line for line in text.splitlines() if line.strip() and not line.lstrip().startswith("#")), "")
     if not first:
@@ -158,7 +171,7 @@ def _table(text: str) -> NDArray[np.float64]:
         if len(numbers) > 1 and "," in text and "." not in re.sub("#.*", "", text):
             # Commas are decimal, but the first line has whole numbers, too.
             with suppress(RequestError):
-                return _table(text.translate(point))
+                return table(text.translate(point))
         raise RequestError(f"not a table of numbers ({error})") from None
 
 
