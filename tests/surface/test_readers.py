@@ -158,7 +158,7 @@ def test_a_missing_file_is_a_missing_file(tmp_path):
         read_height_field(tmp_path / "none.npy", 0.1)
 
 
-@pytest.mark.parametrize("name", ["scan.txt", "scan", "scan.png.bak"])
+@pytest.mark.parametrize("name", ["scan.text", "scan", "scan.png.bak"])
 def test_an_unknown_extension_is_refused_with_the_known_ones(tmp_path, refuse, name):
     (tmp_path / name).write_bytes(b"1 2 3")
     refuse(name, r"wanted one of \.npy, \.npz, \.png, \.tif, \.tiff")
@@ -745,6 +745,33 @@ def test_a_table_that_may_be_points_is_refused(tmp_path, refuse):
     refuse("scan.asc", "wanted the extension .xyz", unit="um")
 
 
+@pytest.mark.parametrize(("name", "mark"), [("scan.csv", ","), ("scan.csv", ";"), ("scan.txt", "\t")])
+def test_numbers_of_a_csv_are_read(tmp_path, refuse, name, mark):
+    path = tmp_path / name
+    path.write_text("\n".join(mark.join(str(h) for h in row) for row in HEIGHTS))
+    np.testing.assert_allclose(read_height_field(path, 0.1, unit="um").heights, HEIGHTS)
+    refuse(name, "pixel_size: the file has none", pixel_size=None, unit="um")
+    refuse(name, "unit: the file names none")
+    lines = points(digits=8).replace(" ", mark)
+    for names in ("", f"x{mark}y{mark}height\n", f'"X"{mark}"Y"{mark}"Z (a. u.)"\n'):
+        path.write_text(names + lines)
+        field = read_height_field(path, unit="um")
+        np.testing.assert_allclose(field.heights, HEIGHTS)
+        assert field.pixel_size == pytest.approx((0.1, 0.2))
+        refuse(name, "unit: the file names none for its lengths")
+    path.write_text(f"x [um]{mark}y [um]{mark}Height (nm)\n" + lines)
+    field = read_height_field(path)
+    np.testing.assert_allclose(field.heights, 1e-3 * HEIGHTS)
+    assert field.pixel_size == pytest.approx((0.1, 0.2))
+    path.write_text(f"x [V]{mark}y [V]{mark}z [V]\n" + lines)
+    refuse(name, "unit: got the unit 'V'")
+
+
+def test_a_table_of_whole_decimal_commas_is_read_as_csv(tmp_path):
+    (tmp_path / "scan.csv").write_text("\n".join(";".join(str(h).replace(".", ",") for h in row) for row in HEIGHTS))
+    np.testing.assert_allclose(read_height_field(tmp_path / "scan.csv", 0.1, unit="um").heights, HEIGHTS)
+
+
 ESRI = "ncols 3\nnrows 2\nxllcorner 10\nyllcorner 20\ncellsize 0.1\nNODATA_value -9999\n"
 
 
@@ -795,6 +822,8 @@ def write_each(path):
         write_gsf(path)
     elif path.suffix == ".xyz":
         path.write_text(points())
+    elif path.suffix == ".csv":
+        path.write_text("x [um],y [um],z [nm]\n" + points().replace(" ", ","))
     else:
         path.write_text(ESRI + "1 2 3\n4 5 6\n")
 
@@ -808,7 +837,7 @@ def test_every_cut_of_a_binary_file_is_refused(tmp_path, refuse, name):
         refuse(name, name, unit="m")
 
 
-@given(name=st.sampled_from(["scan.gwy", "scan.gsf", "scan.xyz", "scan.asc"]), data=st.data())
+@given(name=st.sampled_from(["scan.gwy", "scan.gsf", "scan.xyz", "scan.asc", "scan.csv"]), data=st.data())
 def test_changed_bytes_give_heights_or_one_line(tmp_path_factory, name, data):
     path = tmp_path_factory.mktemp("changed") / name
     write_each(path)

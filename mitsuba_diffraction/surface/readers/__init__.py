@@ -39,6 +39,8 @@ _WITH_UNIT = {
     ".gsf": gwyddion.read_simple_field,
     ".xyz": text.read_points,
     ".asc": text.read_table,
+    ".csv": text.read_csv,
+    ".txt": text.read_csv,
     interferometers.WYKO: interferometers.read_wyko,
     interferometers.ZYGO: interferometers.read_zygo,
 }
@@ -60,7 +62,7 @@ _MAGIC = {
     b"PK\3\4": ".x3p",
 } | interferometers.MAGIC
 _EXTENSIONS = (*_WITHOUT_UNIT, ".gwy", *_WITH_UNIT)
-_OF_MANY_PROGRAMS = (".dat", ".asc", ".xyz")
+_OF_MANY_PROGRAMS = (".dat", ".asc", ".csv", ".txt", ".xyz")
 _HEADER_BYTES = 4096  # of a text
 
 # What a scan that diffracts light can be, µm; outside, a unit is wrong.
@@ -92,6 +94,7 @@ def read_height_field(
     | .xyz | points x y z on a regular grid | unit |
     | .asc, .txt | table of heights exported by Gwyddion, or ESRI grid | unit and pixel_size, if it has none |
     | .asc, .xyz | Wyko ASCII, Zygo XYZ | |
+    | .csv, .txt | points or a table of heights, after a line of names or none | unit; pixel_size of a table |
     | .spm, .000, .nid, .ibw, .sdf, .x3p, … | instrument formats, with the extra `instruments` | |
 
     Args:

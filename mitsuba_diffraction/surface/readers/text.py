@@ -18,6 +18,9 @@ missing pixel. Lines that begin with # are comments. Row 0 has the smallest y.
     NODATA_value -9999
 
 or without a header, if pixel size and unit are given as arguments.
+
+.csv, .txt: either of them, points if there are three columns on a grid. A first line of names is skipped; it may hold
+units in brackets, as in "x [um],y [um],z [nm]".
 """
 
 from __future__ import annotations
@@ -40,6 +43,8 @@ _MIN_POINT_FRACTION = 0.25  # of grid positions that have a point
 _GWYDDION = "Channel", "Width", "Height", "Value units"
 _HEADER_LINE = re.compile(r"#\s*([^:\uff1a#]+?)\s*[:\uff1a](.*)")
 _LENGTH = re.compile(r"([-+.,\deE]*)(.*)")
+_BRACKETS = re.compile(r"[\[(]([^\])]*)[\])]\s*$")
+_NUMBER = re.compile(r"[-+.]*\d|[-+]?(nan|inf)", re.IGNORECASE)
 _DECIMAL_COMMA = re.compile(r"[-+]?\d+,\d+(?:[eE][-+]?\d+)?")
 _ESRI = ("ncols", "nrows", "xllcorner", "yllcorner", "xllcenter", "yllcenter", "cellsize", "nodata_value")
 
@@ -76,9 +81,26 @@ def gridded(points: NDArray[np.float64]) -> tuple[NDArray[np.float64], tuple[flo
     return heights.reshape(rows, columns), (d_x, d_y)
 
 
+def read_csv(path: Path, unit: str | tuple[str, str] | None) -> Scan:
+    """Read points x y z, or a table of heights."""
+    text = contents(path)
+    first, _, rest = text.lstrip().partition("\n")
+    names = [name.strip(' "') for name in re.split("[;,\t]", first)]
+    if not any(_NUMBER.match(name) for name in names) and not first.startswith("#"):
+        text = rest
+        units = [match[1].strip() for name in names if (match := _BRACKETS.search(name))]
+        if len(units) == len(names) and len({*units[:2]}) == 1:
+            unit = units[0], units[-1]
+    numbers = table(text)
+    return _points(numbers, unit) if numbers.shape[1] == 3 and _may_be_points(numbers) else _heights(text, unit)
+
+
 def read_table(path: Path, unit: str | tuple[str, str] | None) -> Scan:
     """Read a table of heights."""
-    text = contents(path)
+    return _heights(contents(path), unit)
+
+
+def _heights(text: str, unit: str | tuple[str, str] | None) -> Scan:
     if text.lstrip()[:5].lower() == "ncols":
         return _esri(text, unit)
     header = _gwyddion_header(text)
