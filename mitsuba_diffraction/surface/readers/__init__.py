@@ -89,6 +89,7 @@ def read_height_field(
     | .npz | array `heights`, as .npy, and optionally `pixel_size` in µm, one number or (x, y) | as .npy |
     | .png, .tif, .tiff | 8 or 16 bit grey; colour if grey and opaque but for annotation | pixel_size, height_range |
     | .tif, .tiff | 32 bit float, µm, or `unit` | pixel_size |
+    | .tif | relief that `design` wrote | |
     | .tif, .tiff | Park Systems, with the extra `instruments` | |
     | .gwy, .gsf | Gwyddion, Gwyddion Simple Field | unit, if the file has none |
     | .xyz | points x y z on a regular grid | unit |
@@ -101,7 +102,7 @@ def read_height_field(
         path: the file; its extension determines the format, and its content if that is unknown.
         pixel_size: µm, one number or (x, y). Overrides that of the file; required if the file has none.
         height_range: height of the full range of the integer type (black to white), µm; heights start at zero.
-            For integers only.
+            For integers only. Overrides that of the file.
         fill_missing: interpolate NaN or infinite pixels (`heightfield.harmonic_fill`), do not refuse them; `source`
             and `filled` of the height field report their number.
         channel: of a file with several (.gwy and instrument formats), by name or number. None selects the one that
@@ -129,6 +130,7 @@ def read_height_field(
         with np.errstate(over="ignore", invalid="ignore"):
             scan = _read(path, channel, unit)
             integers = scan.numbers.dtype.kind in "iu"
+            height_range = scan.height_range if height_range is None else height_range
             if pixel_size is None and scan.pixel_size is None and height_range is None and integers:
                 raise RequestError(
                     f"pixel_size, height_range: both missing for {scan.numbers.dtype} heights, wanted one number or "

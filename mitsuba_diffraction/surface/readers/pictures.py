@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 import tokenize
 import warnings
 import zipfile
@@ -16,6 +17,7 @@ from numpy.typing import NDArray
 from PIL import Image, UnidentifiedImageError
 
 from ...errors import RequestError
+from ...outputs import MARK
 from .scan import DAMAGED, MAX_BYTES, Scan
 
 
@@ -64,6 +66,8 @@ def _load_array(file: IO[bytes]) -> NDArray:
         raise RequestError(f"not an array that can be read ({error})") from None
 
 
+_LENGTH = r"(\d+\.?\d*(?:e[-+]?\d+)?)"
+_OWN_SCALE = re.compile(rf"Pixel size {_LENGTH}(?: [×x] {_LENGTH})? [uµ]m; height {_LENGTH} [uµ]m from black")
 MAX_ANNOTATION_FRACTION = 0.25  # of pixels that are coloured, such as a scale bar; a colour map has more
 
 
@@ -87,7 +91,8 @@ def read(path: Path) -> Scan:
                 pages = getattr(picture, "n_frames", 1)
                 if pages != 1:
                     raise RequestError(f"got {pages} pages or frames, wanted one")
-                return Scan(_numbers_of(picture))
+                pixel_size, height_range = _own_scale(picture)
+                return Scan(_numbers_of(picture), pixel_size, height_range=height_range)
         except UnidentifiedImageError:
             raise RequestError("not a PNG or TIFF picture that can be read") from None
         except (Image.DecompressionBombError, Image.DecompressionBombWarning) as error:
@@ -99,6 +104,15 @@ def read(path: Path) -> Scan:
             raise
         except (*DAMAGED, ValueError) as error:
             raise RequestError(f"a damaged picture ({type(error).__name__}: {error})") from None
+
+
+def _own_scale(picture: Image.Image) -> tuple[tuple[float, float] | None, float | None]:
+    """Return pixel size and height range, µm, of a TIFF that this package wrote, as its description has them."""
+    description = str(picture.tag_v2.get(270, "")) if picture.format == "TIFF" else ""
+    if not (description.startswith(MARK) and (found := _OWN_SCALE.search(description))):
+        return None, None
+    x, y, height = found.groups()
+    return (float(x), float(y or x)), float(height)
 
 
 def _numbers_of(picture: Image.Image) -> NDArray:

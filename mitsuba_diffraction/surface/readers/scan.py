@@ -84,12 +84,14 @@ class Scan:
         pixel_size: (x, y) in µm; None if the file has none.
         channel: the name of the channel, in formats with several.
         doubt: how the file contradicts itself about the pixel size, or leaves it in doubt.
+        height_range: of the full range of integers, µm; None if the file has none.
     """
 
     numbers: NDArray
     pixel_size: tuple[float, float] | None = None
     channel: str = ""
     doubt: str = ""
+    height_range: float | None = None
 
 
 @dataclass(frozen=True)
