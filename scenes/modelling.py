@@ -11,12 +11,13 @@ import time
 from collections.abc import Callable, Sequence
 from pathlib import Path
 
-import mitsuba as mi
 import numpy as np
 from numpy.typing import NDArray
 from PIL import Image
 
 from mitsuba_diffraction.files import whole_file
+
+import mitsuba as mi  # isort: skip  (after LLVM has been chosen)
 
 Array = NDArray[np.float64]
 

@@ -3,9 +3,11 @@
 import ast
 import functools
 import graphlib
+import json
 import re
 import subprocess
 import sys
+import textwrap
 from pathlib import Path
 
 import pytest
@@ -162,3 +164,65 @@ def test_plugins_are_registered_whenever_the_package_is_imported(lines):
     blaze = "{'type': 'diffraction_grating', 'profile': 'blazed', 'depth': 0.05, 'conserve_energy': False}"
     printed = in_a_fresh_process("\n".join([*lines, f"print(type(mitsuba.load_dict({blaze})).__name__)"]))
     assert printed == ["DiffractionGrating"]
+
+
+REPOSITORY = PACKAGE.parent
+SCRIPTS = sorted(path for folder in ("docs", "precompute", "scenes") for path in (REPOSITORY / folder).rglob("*.py"))
+PAGES = [REPOSITORY / "README.md", *sorted((REPOSITORY / "docs").rglob("*.md")), *REPOSITORY.glob("notebooks/*.ipynb")]
+
+
+def program_of(path):
+    """The Python of a script, of all cells of a notebook or of all blocks of code of a page."""
+    text = path.read_text(encoding="utf-8")
+    if path.suffix == ".ipynb":
+        cells = ["".join(cell["source"]) for cell in json.loads(text)["cells"] if cell["cell_type"] == "code"]
+        return "\n".join(line for cell in cells for line in cell.splitlines() if not line.startswith(("%", "!")))
+    if path.suffix == ".md":
+        return "\n".join(map(textwrap.dedent, re.findall(r"^ *```python\n(.*?)^ *```", text, re.MULTILINE | re.DOTALL)))
+    return text
+
+
+def imported_in_order(program, folder, outer=()):
+    """The top-level packages that a program imports, in the order of execution; its functions run last.
+
+    Modules beside the program are followed.
+    """
+    statements, later = list(ast.parse(program).body), []
+    while statements or later:
+        node = (statements or later).pop(0)
+        names = [alias.name for alias in node.names] if isinstance(node, ast.Import) else []
+        if isinstance(node, ast.ImportFrom):
+            names = [node.module]
+        for name in names:
+            beside = folder / f"{name}.py"
+            if beside.is_file() and beside not in outer:
+                yield from imported_in_order(beside.read_text(encoding="utf-8"), folder, (*outer, beside))
+            yield name.partition(".")[0]
+        if isinstance(node, ast.If) and ast.unparse(node.test) == "TYPE_CHECKING":
+            continue
+        inner = [child for child in ast.iter_child_nodes(node) if isinstance(child, ast.stmt | ast.excepthandler)]
+        if isinstance(node, ast.FunctionDef):
+            later += inner
+        else:
+            statements[:0] = inner
+
+
+@pytest.mark.quick
+@pytest.mark.parametrize("path", [*SCRIPTS, *PAGES], ids=lambda path: str(path.relative_to(REPOSITORY)))
+def test_the_package_is_imported_before_mitsuba(path):
+    """Otherwise Dr.Jit has loaded the system's LLVM, which may be too old, before the package can choose another."""
+    found = list(imported_in_order(program_of(path), path.parent))
+    mitsuba = min((found.index(name) for name in ("mitsuba", "drjit") if name in found), default=len(found))
+    assert "mitsuba_diffraction" not in found[mitsuba:] or "mitsuba_diffraction" in found[:mitsuba]
+
+
+@pytest.mark.quick
+def test_an_import_of_mitsuba_first_is_found(tmp_path):
+    (tmp_path / "helper.py").write_text("import mitsuba.python as mi\n")
+    for program, wanted in (
+        ("import helper\nimport mitsuba_diffraction as md", "mitsuba"),
+        ("import mitsuba_diffraction\nimport helper", "mitsuba_diffraction"),
+        ("def f():\n    import drjit\nfrom mitsuba_diffraction.render import render", "mitsuba_diffraction"),
+        ("try:\n    import drjit\nfinally:\n    import mitsuba_diffraction", "drjit"),
+    ):
+        assert next(imported_in_order(program, tmp_path)) == wanted

@@ -13,7 +13,6 @@ from collections.abc import Iterable, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-import mitsuba as mi
 import numpy as np
 from brdf_map import MAP_METHODS, PROJECTIONS, BRDFMap, brdf_map
 from published_surfaces import SURFACES, PublishedSurface
@@ -34,6 +33,8 @@ from mitsuba_diffraction.evaluation.realtime_shader.quirks import Quirks
 from mitsuba_diffraction.evaluation.report import markdown, save_markdown
 from mitsuba_diffraction.llvm import choose_variant
 from mitsuba_diffraction.progress import Progress, progress_bar, silent
+
+import mitsuba as mi  # isort: skip  (after LLVM has been chosen)
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes

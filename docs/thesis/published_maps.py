@@ -18,7 +18,6 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, NamedTuple
 
-import mitsuba as mi
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from PIL import Image
@@ -40,6 +39,8 @@ from mitsuba_diffraction.recipe import Recipe
 from mitsuba_diffraction.settings import Settings
 from mitsuba_diffraction.surface.heightfield import HeightField
 from mitsuba_diffraction.testing import array, vectors
+
+import mitsuba as mi  # isort: skip  (after LLVM has been chosen)
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure

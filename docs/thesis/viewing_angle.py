@@ -12,7 +12,6 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import NamedTuple
 
-import mitsuba as mi
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from published_surfaces import PublishedSurface
@@ -24,6 +23,8 @@ from mitsuba_diffraction.evaluation.realtime_shader.evaluate import relative_rad
 from mitsuba_diffraction.evaluation.realtime_shader.quirks import Quirks
 from mitsuba_diffraction.grating_spectrum import GratingSpectrum
 from mitsuba_diffraction.llvm import is_supported
+
+import mitsuba as mi  # isort: skip  (after LLVM has been chosen)
 
 Array = NDArray[np.float64]
 
