@@ -45,7 +45,7 @@ Materials = Mapping[str, Mapping[str, bool | float | str]]
 
 _PLUGINS = ("diffraction_grating", "diffraction_path", "diffraction_shader")
 # Of BSDFs; `principled` has `spec_trans`.
-_TRANSMITTING = {"dielectric", "roughdielectric", "thindielectric", "principledthin", "mask", "null"}
+_TRANSMITTING = {"dielectric", "roughdielectric", "thindielectric", "principledthin", "null"}
 _RAYS_OF_SENSOR = 4096  # to sample the visible surfaces and their lights
 _MAX_LOBE_VALUE = 1e4  # of a BSDF with narrow lobes, 1/sr
 _MAX_NOISE_FACTOR = 1e4  # of the luminance of a pixel over that of the brightest light
@@ -103,9 +103,10 @@ def load_spectral_scene(
             the aspect ratio is preserved.
         height: likewise.
         parameters: values for the scene's `$name` parameters (`-Dname=value` of Mitsuba's command line).
-        materials: id of a BSDF → parameters of the `diffraction_grating` that replaces it. Below a dielectric of scalar
-            theory the BSDF remains as `base`, unless that is given; "none" stands for none. A `twosided` remains around
-            a grating that does not transmit light. `path` becomes `diffraction_path`.
+        materials: id of a BSDF → parameters of the `diffraction_grating` that replaces it. Of a BSDF that holds others
+            (`twosided`, `mask`, `normalmap`, `bumpmap`, `blendbsdf`), these are replaced; only a `twosided` around a
+            grating that transmits light is removed. Below a dielectric of scalar theory the BSDF remains as `base`,
+            unless that is given; "none" stands for none. `path` becomes `diffraction_path`.
         motion: of the first sensor: an affine map of world space, 16 numbers in row-major order, applied after its
             `to_world`.
 
@@ -122,7 +123,7 @@ def load_spectral_scene(
     with parsed(path, parameters, materials) as (config, state):
         if materials:
             _check_materials(materials)
-            _warn_of_unused_materials(config, state, materials)
+            _warn_of_unused_materials(state, materials)
         _replace_films(state, width, height)
         _unwrap_integrators(state)
         if materials:
@@ -154,17 +155,14 @@ def warn_of_gratings(scene: mi.Scene) -> None:
     _warn_of_light_from_below(scene)
 
 
-def _warn_of_unused_materials(
-    config: mi.parser.ParserConfig, state: mi.parser.ParserState, materials: Materials
-) -> None:
+def _warn_of_unused_materials(state: mi.parser.ParserState, materials: Materials) -> None:
     """Log a warning for each grating that replaces a BSDF to which nothing in the scene refers."""
-    mi.parser.transform_resolve(config, state)
     # Follow references from all objects of the scene except its BSDFs.
-    waiting = [k for k in _children(state, state.root.props) if state.nodes[k].type != mi.ObjectType.BSDF]
+    waiting = [k for k in _children(state, state.root.props).values() if state.nodes[k].type != mi.ObjectType.BSDF]
     used = set()
     while waiting:
         used.add(node := waiting.pop())
-        waiting += [child for child in _children(state, state.nodes[node].props) if child not in used]
+        waiting += [child for child in _children(state, state.nodes[node].props).values() if child not in used]
     for name in materials:
         if state.id_to_index[name] not in used:
             _log.warning("material %s: no shape uses the BSDF with that id, so the picture is unaffected", name)
@@ -297,7 +295,8 @@ def has_alpha(path: str | os.PathLike[str], parameters: Mapping[str, str] | None
 def _of_first_sensor(state: mi.parser.ParserState, kind: mi.ObjectType) -> list[mi.Properties]:
     """Return the properties of the children of a kind of the first sensor, if there is one."""
     sensors = [node for node in state.nodes if node.type == mi.ObjectType.Sensor]
-    return [mi.Properties(state.nodes[k].props) for sensor in sensors[:1] for k in _children(state, sensor.props, kind)]
+    children = [k for sensor in sensors[:1] for k in _children(state, sensor.props, kind).values()]
+    return [mi.Properties(state.nodes[k].props) for k in children]
 
 
 def scene_digest(
@@ -362,7 +361,9 @@ def parsed(
     try:
         config = mi.parser.ParserConfig(mi.variant() or "scalar_spectral")
         state = mi.parser.parse_file(config, str(path.resolve()), **(parameters or {}))
-        _replace_materials(state, materials or {})
+        if materials:
+            mi.parser.transform_resolve(config, state)
+            _replace_materials(state, materials)
         _refuse_missing_files(path, state)
         yield config, state
     except Exception as error:
@@ -399,10 +400,9 @@ def _has_base(values: Mapping[str, bool | float | str]) -> bool:
     return values.get("theory") != "rigorous" and not is_rigorous(path)
 
 
-def _transmits(state: mi.parser.ParserState, props: mi.Properties) -> bool:
-    """Return whether a BSDF of the scene, or one nested in it, transmits light."""
-    is_glass = props.plugin_name() in _TRANSMITTING or mi.Properties(props).get("spec_trans", 0.0) != 0
-    return is_glass or any(_transmits(state, state.nodes[k].props) for k in _children(state, props, mi.ObjectType.BSDF))
+def _transmits(props: mi.Properties) -> bool:
+    """Return whether a BSDF that holds no other transmits light."""
+    return props.plugin_name() in _TRANSMITTING or mi.Properties(props).get("spec_trans", 0.0) != 0
 
 
 def _replace_materials(state: mi.parser.ParserState, materials: Materials) -> None:
@@ -412,24 +412,41 @@ def _replace_materials(state: mi.parser.ParserState, materials: Materials) -> No
         if name not in bsdfs:
             known = ", ".join(sorted(filter(None, bsdfs))) or "none: its BSDFs have no ids"
             raise RequestError(f"material: got the id {name!r}, the ids of BSDFs in the scene are {known}")
-        grating, index = _grating(values), bsdfs[name]
-        # A copy, as adding nodes invalidates references to them.
-        replaced = mi.Properties(state.nodes[index].props)
-        if _has_base(values):
-            if _transmits(state, replaced):
-                raise RequestError(
-                    f"material {name}: got a dielectric in the place of a BSDF that transmits light, wanted "
-                    "transmission=sheet or interface, a metal (material=Al), or base=none"
-                )
-            below = mi.Properties(replaced)
-            below.set_id("")
-            grating["base"] = _add(state, mi.ObjectType.BSDF, below)
-        if replaced.plugin_name() == "twosided" and grating.get("transmission", "none") == "none":
-            both_sides = mi.Properties("twosided")
-            both_sides["bsdf"] = _add(state, mi.ObjectType.BSDF, grating)
-            grating = both_sides
-        grating.set_id(name)
-        state.nodes[index].props = grating
+        try:
+            replaced = _with_grating(state, bsdfs[name], values)
+        except RequestError as error:
+            raise RequestError(f"material {name}: {error}") from None
+        replaced.set_id(name)
+        state.nodes[bsdfs[name]].props = replaced
+
+
+def _with_grating(state: mi.parser.ParserState, index: int, values: Mapping[str, bool | float | str]) -> mi.Properties:
+    """Return a BSDF without id in which gratings replace the BSDFs that hold no others; a nested `null` remains.
+
+    BSDFs that others in the scene may refer to are copied.
+    """
+    # A copy, as adding nodes invalidates references to them.
+    props = mi.Properties(state.nodes[index].props)
+    props.set_id("")
+    inner = {} if props.plugin_name() == "diffraction_grating" else _children(state, props, mi.ObjectType.BSDF)
+    parts = {
+        key: _with_grating(state, k, values) for key, k in inner.items() if state.nodes[k].props.plugin_name() != "null"
+    }
+    if parts:
+        if props.plugin_name() == "twosided" and values.get("transmission", "none") != "none":
+            return next(iter(parts.values()))
+        for key, part in parts.items():
+            props[key] = _add(state, mi.ObjectType.BSDF, part)
+        return props
+    grating = _grating(values)
+    if _has_base(values):
+        if _transmits(props):
+            raise RequestError(
+                "got a dielectric in the place of a BSDF that transmits light, wanted transmission=sheet or "
+                "interface, a metal (material=Al), or base=none"
+            )
+        grating["base"] = _add(state, mi.ObjectType.BSDF, props)
+    return grating
 
 
 def files_of_scene(
@@ -472,8 +489,8 @@ def _unwrap_integrators(state: mi.parser.ParserState) -> None:
     """Replace integrators that add other quantities to radiance by the integrator nested in them."""
     for node in state.nodes:
         is_wrapper = node.type == mi.ObjectType.Integrator and node.props.plugin_name() in ("aov", "moment")
-        if is_wrapper and (inner := list(_children(state, node.props, mi.ObjectType.Integrator))):
-            node.props = mi.Properties(state.nodes[inner[0]].props)
+        if is_wrapper and (inner := _children(state, node.props, mi.ObjectType.Integrator)):
+            node.props = mi.Properties(state.nodes[next(iter(inner.values()))].props)
 
 
 def _trace_cast_light(state: mi.parser.ParserState) -> None:
@@ -510,12 +527,12 @@ def _replace_films(state: mi.parser.ParserState, width: int | None, height: int 
             state.nodes[index].props = props
 
 
-def _children(state: mi.parser.ParserState, props: mi.Properties, kind: mi.ObjectType | None = None) -> dict[int, str]:
-    """Return index in the parser's list → name of the children of a node; only those of `kind`, if it is given."""
+def _children(state: mi.parser.ParserState, props: mi.Properties, kind: mi.ObjectType | None = None) -> dict[str, int]:
+    """Return name → index in the parser's list of the children of a node; only those of `kind`, if it is given."""
     # Of a copy: reading marks a property as used, and Mitsuba reports unused ones as errors.
     copy, kind_of_reference = mi.Properties(props), mi.Properties.Type.ResolvedReference
-    references = [(copy[name].index(), name) for name in copy.keys() if copy.type(name) == kind_of_reference]  # noqa: SIM118
-    return {index: name for index, name in references if kind in (None, state.nodes[index].type)}
+    references = [(name, copy[name].index()) for name in copy.keys() if copy.type(name) == kind_of_reference]  # noqa: SIM118
+    return {name: index for name, index in references if kind in (None, state.nodes[index].type)}
 
 
 def _add(state: mi.parser.ParserState, kind: mi.ObjectType, props: mi.Properties) -> mi.Properties.ResolvedReference:
@@ -561,7 +578,7 @@ def _spectral_film(
         )
     if "sample_border" in old:
         film["sample_border"] = old["sample_border"]
-    for index, name in _children(state, old, mi.ObjectType.ReconstructionFilter).items():
+    for name, index in _children(state, old, mi.ObjectType.ReconstructionFilter).items():
         film[name] = mi.Properties.ResolvedReference(index)
     spectral_range = _spectral_range(state, old)
     centres = channel_wavelengths(spectral_range)
@@ -580,7 +597,9 @@ def _spectral_range(state: mi.parser.ParserState, film: mi.Properties) -> Spectr
     """Return the wavelengths from the shortest to the longest of a film's bands if some are not visible, else these."""
     if film.plugin_name() != "specfilm":
         return VISIBLE
-    textures = [mi.Properties(state.nodes[index].props) for index in _children(state, film, mi.ObjectType.Texture)]
+    textures = [
+        mi.Properties(state.nodes[index].props) for index in _children(state, film, mi.ObjectType.Texture).values()
+    ]
     ranges = [mi.PluginManager.instance().create_object(texture).wavelength_range() for texture in textures]
     tables = [film[name].wavelengths for name in film.keys() if film.type(name) == mi.Properties.Type.Spectrum]  # noqa: SIM118
     ranges += [(min(table), max(table)) for table in tables if len(table)]

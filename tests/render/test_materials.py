@@ -1,6 +1,7 @@
 """Gratings that replace BSDFs in scenes exported by other programs."""
 
 import logging
+import re
 from pathlib import Path
 from types import SimpleNamespace
 
@@ -37,7 +38,6 @@ BLEND = (
     '<bsdf type="blendbsdf"><float name="weight" value="0.5"/><bsdf type="plastic"/>'
     '<bsdf type="diffuse" id="b"/></bsdf>'
 )
-MASK = '<bsdf type="twosided"><bsdf type="mask"><float name="opacity" value="0.5"/><bsdf type="diffuse"/></bsdf></bsdf>'
 # As the add-on for Blender writes it.
 EXPORTED = """<scene version="2.1.0">
     <default name="spp" value="4"/>
@@ -98,15 +98,100 @@ def test_a_replaced_material_renders_as_if_the_scene_had_the_grating(exported):
     assert not before[0, 0].any()
 
 
-def test_the_replaced_bsdf_remains_below_a_dielectric(exported):
-    dielectric = {key: value for key, value in MIRROR.items() if key != "material"}
-    below = PLAIN.replace(
-        '<string name="material" value="none"/>', f'<bsdf type="twosided" name="base">{PRINCIPLED}</bsdf>'
+DISC = f'<bsdf type="twosided" id="mat-Disc" name="mat-Disc">{PRINCIPLED}</bsdf>'
+DIELECTRIC = {key: value for key, value in MIRROR.items() if key != "material"}
+PIGMENT = '<bsdf type="diffuse" NAME><float name="reflectance" value="0.3"/></bsdf>'
+WRAPPERS = {
+    "mask": '<bsdf type="mask" NAME><float name="opacity" value="0.3"/>PART</bsdf>',
+    "normal map": '<bsdf type="normalmap" NAME><rgb name="normalmap" value="0.6 0.5 0.9"/>PART</bsdf>',
+    "bump map": '<bsdf type="bumpmap" NAME><texture type="checkerboard" name="arbitrary"/>'
+    '<float name="scale" value="0.2"/>PART</bsdf>',
+    "blend": '<bsdf type="blendbsdf" NAME><float name="weight" value="0.25"/>PARTPART</bsdf>',
+    "both sides": '<bsdf type="twosided" NAME>PARTPART</bsdf>',
+    "mask of a normal map of both sides": '<bsdf type="mask" NAME><float name="opacity" value="0.3"/>'
+    '<bsdf type="normalmap"><rgb name="normalmap" value="0.6 0.5 0.9"/><bsdf type="twosided">PART</bsdf></bsdf></bsdf>',
+    "blend with nothing": '<bsdf type="blendbsdf" NAME><float name="weight" value="0.25"/>'
+    '<bsdf type="null"/>PART</bsdf>',
+    "blend of masks": '<bsdf type="blendbsdf" NAME><float name="weight" value="0.25"/>'
+    '<bsdf type="mask"><float name="opacity" value="0.4"/>PART</bsdf>PART</bsdf>',
+}
+
+
+def tree(state, node):
+    """The plugin of a node of a parsed scene with its parameters, nested."""
+    props = mi.Properties(node.props)
+    resolved = mi.Properties.Type.ResolvedReference
+    values = {
+        key: tree(state, state.nodes[props[key].index()]) if props.type(key) == resolved else props[key]
+        for key in props.keys()  # noqa: SIM118
+    }
+    return props.plugin_name(), {key: str(x) if "Color" in type(x).__name__ else x for key, x in values.items()}
+
+
+def parsed_disc(path, materials=None):
+    """The BSDF of the disc of an exported scene as it is parsed, see `tree`."""
+    with parsed(path, None, materials) as (config, state):
+        mi.parser.transform_resolve(config, state)
+        (disc,) = [node for node in state.nodes if node.props.id() == "mat-Disc"]
+        return tree(state, disc)
+
+
+@pytest.mark.parametrize("referenced", [False, True], ids=["nested", "by reference"])
+@pytest.mark.parametrize("values", [MIRROR, DIELECTRIC], ids=["mirror", "dielectric"])
+@pytest.mark.parametrize("wrapper", WRAPPERS)
+def test_the_grating_is_put_inside_of_what_wraps_a_material(exported, wrapper, values, referenced):
+    """As if the scene had been written with it, and materials that others share are left alone."""
+    path, text = exported(), WRAPPERS[wrapper].replace("NAME", 'id="mat-Disc"')
+    pigment, shared = PIGMENT.replace("NAME", ""), PIGMENT.replace("NAME", 'id="shared"')
+    base = pigment.replace("<bsdf", '<bsdf name="base"') if values is DIELECTRIC else ""
+    material = "" if values is DIELECTRIC else '<string name="material" value="none"/>'
+    plain = PLAIN.replace('<string name="material" value="none"/>', material)
+    grating = f'<bsdf type="diffraction_grating">{plain}{base}</bsdf>'
+    before = path.read_text().replace(DISC, "BSDF")
+    path.write_text(before.replace("BSDF", text.replace("PART", grating)))
+    wanted = parsed_disc(path)
+    part = '<ref id="shared"/>' if referenced else pigment
+    path.write_text(before.replace("BSDF", text.replace("PART", part) + shared))
+    assert parsed_disc(path, {"mat-Disc": values}) == wanted
+    with parsed(path, None, {"mat-Disc": values}) as (_, state):
+        (kept,) = [node.props for node in state.nodes if node.props.id() == "shared"]
+        assert kept.plugin_name() == "diffuse"
+
+
+def test_a_grating_that_transmits_light_is_on_no_side_of_a_mask(exported):
+    """A `twosided` cannot hold it, and the mask remains."""
+    path = exported()
+    text = WRAPPERS["mask of a normal map of both sides"].replace("NAME", 'id="mat-Disc"').replace("PART", PRINCIPLED)
+    path.write_text(path.read_text().replace(DISC, text))
+    glass = {**DIELECTRIC, "transmission": "sheet"}
+    plugins = re.findall(
+        r"'(mask|normalmap|twosided|diffraction_grating)'", str(parsed_disc(path, {"mat-Disc": glass}))
     )
+    assert plugins.count("twosided") == 0
+    assert {"mask", "normalmap", "diffraction_grating"} <= set(plugins)
+    load_spectral_scene(path, materials={"mat-Disc": glass})
+
+
+def test_the_opacity_of_a_masked_material_remains(exported):
+    """In front of a black floor, a mirror reflects that fraction."""
+    path = exported()
+    text = path.read_text().replace('value="0.5 0.5 0.5"', 'value="0 0 0"')
+    means = []
+    for opacity in (1, 0.3):
+        mask = f'<bsdf type="mask" id="mat-Disc"><float name="opacity" value="{opacity}"/><bsdf type="diffuse"/></bsdf>'
+        path.write_text(text.replace(DISC, mask))
+        image = render(path, spp=1024, width=16, materials={"mat-Disc": MIRROR})
+        means.append(image.radiance[4:8, 6:10].mean())
+    # The standard error of 0.3 of 16384 samples is 1.2 %.
+    assert means[1] == pytest.approx(0.3 * means[0], rel=0.05)
+
+
+def test_the_replaced_bsdf_remains_below_a_dielectric(exported):
+    below = PLAIN.replace('<string name="material" value="none"/>', PRINCIPLED.replace('bsdf"', 'base"', 1))
     wanted = render(exported(f'<bsdf type="diffraction_grating" name="bsdf">{below}</bsdf>'), spp=2).radiance
-    found = render(path := exported(), spp=2, materials={"mat-Disc": dielectric}).radiance
+    found = render(path := exported(), spp=2, materials={"mat-Disc": DIELECTRIC}).radiance
     np.testing.assert_array_equal(found, wanted)
-    bare = render(path, spp=2, materials={"mat-Disc": {**dielectric, "base": "none"}}).radiance
+    bare = render(path, spp=2, materials={"mat-Disc": {**DIELECTRIC, "base": "none"}}).radiance
     assert found.mean() > 2 * bare.mean()
 
 
@@ -136,7 +221,12 @@ def test_a_base_remains_where_light_reaches_it(exported, tmp_path, values, kept)
 
 
 @pytest.mark.parametrize(
-    "glass", ['<bsdf type="thindielectric"/>', PRINCIPLED.replace("roughness", "spec_trans"), MASK]
+    "glass",
+    [
+        '<bsdf type="thindielectric"/>',
+        PRINCIPLED.replace("roughness", "spec_trans"),
+        '<bsdf type="mask"><float name="opacity" value="0.5"/><bsdf type="thindielectric"/></bsdf>',
+    ],
 )
 def test_a_dielectric_in_the_place_of_glass_is_refused(exported, glass):
     path = exported()
