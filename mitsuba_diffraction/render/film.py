@@ -12,6 +12,7 @@ from __future__ import annotations
 
 import functools
 import tempfile
+from bisect import bisect_right
 from collections.abc import Callable
 from itertools import pairwise
 from pathlib import Path
@@ -24,7 +25,7 @@ from numpy.typing import NDArray
 
 from ..errors import RequestError, root_cause
 from ..integrator.paths import LightPaths, generator, unpacked
-from .scene import channel_wavelengths, channel_weights, recorded_range, wavelengths_of
+from .scene import channel_wavelengths, channel_weights, no_warnings, recorded_range, wavelengths_of
 
 Rows = tuple[int, int]
 """The first row of a band of a picture, and the row after its last."""
@@ -77,7 +78,7 @@ def trace_pass(
 
     Args:
         scene: from `load_spectral_scene`.
-        spp: samples per pixel; the scene's sampler may draw more (`samples_drawn`).
+        spp: samples per pixel; the scene's sampler may draw more (`sampler_of`).
         seed: 32 bits.
         integrator: replaces that of the scene.
         rows: those to be traced; default: all. Samples outside them, but under the filter of one of their pixels,
@@ -145,11 +146,23 @@ def _available_memory() -> int | None:
         return None
 
 
-def samples_drawn(scene: mi.Scene, spp: int) -> int:
-    """Return the samples per pixel that the sampler draws for `spp`; some round up to a square or a power of two."""
-    sampler = scene.sensors()[0].sampler().clone()
-    sampler.set_sample_count(spp)
-    return sampler.sample_count()
+def sampler_of(sampler: mi.Sampler, spp: int) -> mi.Sampler:
+    """Return a copy of a sampler that draws `spp` samples per pixel; some round up, to a square or a power of four."""
+    copy = sampler.clone()
+    with no_warnings():
+        copy.set_sample_count(spp)
+    return copy
+
+
+def max_samples(sampler: mi.Sampler, limit: int) -> int:
+    """Return the largest number of samples per pixel up to a limit that a sampler draws, zero if there is none."""
+    numbers = range(1, limit + 1)
+
+    def drawn(spp: int) -> int:
+        return sampler_of(sampler, spp).sample_count()
+
+    # The largest that is rounded to at most the limit.
+    return bisect_right(numbers, limit, key=drawn)
 
 
 def is_independent(sampler: mi.Sampler) -> bool:
@@ -204,7 +217,7 @@ def _fraction(number: mi.Float) -> mi.Float:
 def trace_with_mitsubas_film(scene: mi.Scene, integrator: mi.Integrator, spp: int, seed: int) -> NDArray[np.float32]:
     recorded = np.array(mi.render(scene, integrator=integrator, spp=spp, seed=seed))
     picture = recorded / channel_weights(recorded_range(scene)).astype(np.float32)
-    count = np.float32(samples_drawn(scene, spp))
+    count = np.float32(sampler_of(scene.sensors()[0].sampler(), spp).sample_count())
     return np.concatenate([picture * count, np.full((*picture.shape[:2], 1), count)], axis=-1)
 
 
@@ -265,8 +278,7 @@ def _trace(
     traced_columns, traced_rows = columns + 2 * border, end - first + sum(margins[1:])
     light_seed, seed = seed, pass_seed(seed, first) if first else seed
 
-    sampler = sensor.sampler().clone()
-    sampler.set_sample_count(spp)
+    sampler = sampler_of(sensor.sampler(), spp)
     spp = sampler.sample_count()
     sampler.set_samples_per_wavefront(spp)
     size = traced_columns * traced_rows * spp

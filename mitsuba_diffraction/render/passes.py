@@ -25,7 +25,7 @@ import weakref
 from collections.abc import Callable, Generator, Iterator, Mapping
 from contextlib import closing, contextmanager, nullcontext
 from dataclasses import asdict, dataclass, fields
-from functools import cached_property
+from functools import cache, cached_property, partial
 from importlib import metadata
 from pathlib import Path
 from typing import Any
@@ -46,9 +46,10 @@ from .film import (
     bands_of,
     check_memory,
     is_independent,
+    max_samples,
     needs_mitsubas_film,
     pass_seed,
-    samples_drawn,
+    sampler_of,
     trace_pass,
 )
 from .scene import (
@@ -459,7 +460,7 @@ def render(
 
     Args:
         scene_path: an XML scene; its film may be of any kind (see `load_spectral_scene`).
-        spp: samples per pixel, four wavelengths each; the scene's sampler may round it up.
+        spp: samples per pixel, four wavelengths each; the scene's sampler may add up to three.
         width, height, parameters, materials, motion: as of `load_spectral_scene`.
         seed: random seed, not negative.
         until_error: stop when the relative error of the picture (`error_of_picture`) is at most this; spp is then the
@@ -646,15 +647,25 @@ def _warn_of_implausible_pixels(luminance: NDArray[np.float32], limit: float) ->
 def split(scene: mi.Scene, spp: int, min_passes: int = 1) -> tuple[int, ...]:
     """Return the samples per pixel of each pass; at least `min_passes` passes, if there are enough samples.
 
-    They are determined by the request only, so that an interruption does not change the passes.
+    They are numbers that the sampler draws (`max_samples`). If its smallest one does not divide `spp`, the last pass
+    exceeds that. They are determined by the request only, so that an interruption does not change the passes.
     """
+    sampler = scene.sensors()[0].sampler()
     pixels = math.prod(scene.sensors()[0].film().crop_size())
     passes = -(-spp * pixels // max(SAMPLES_PER_PASS, SAMPLES_PER_PIXEL_OF_LARGE_PICTURES * pixels))
     if passes > _MAX_PASSES:
         raise RequestError(f"spp: got {spp}, wanted at most {_MAX_PASSES * spp // passes:.2g} for so large a picture")
     passes = min(max(passes, min_passes), spp)
-    ends = [spp * index // passes for index in range(passes + 1)]
-    return tuple(samples_drawn(scene, end - start) for start, end in itertools.pairwise(ends))
+    ends = (spp * index // passes for index in range(1, passes))
+    largest, smallest = cache(partial(max_samples, sampler)), sampler_of(sampler, 1).sample_count()
+    samples: list[int] = []
+    total = 0
+    while total < spp:
+        end = next(ends, spp)
+        if size := largest(end - total) or (smallest if end == spp else 0):
+            samples.append(size)
+            total += size
+    return tuple(samples)
 
 
 def _is_complete(sums: BandedSums, job: Job, progress: Callable[[float, float, float], None]) -> bool:

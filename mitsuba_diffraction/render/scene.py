@@ -131,6 +131,7 @@ def load_spectral_scene(
         if motion is not None:
             _move_first_sensor(state, motion)
         mi.parser.transform_all(config, state)
+        _round_sample_counts(state)
         # Serially: on several threads, Mitsuba 3.9.1 crashed once in a loop of loads and renderings.
         config.parallel = False
         scene = mi.parser.instantiate(config, state)
@@ -525,6 +526,26 @@ def _replace_films(state: mi.parser.ParserState, width: int | None, height: int 
         elif kind == mi.ObjectType.Sensor and not _children(state, props, mi.ObjectType.Film):
             props["film"] = _add(state, mi.ObjectType.Film, _spectral_film(state, mi.Properties(), width, height))
             state.nodes[index].props = props
+
+
+@contextmanager
+def no_warnings() -> Iterator[None]:
+    """Let Mitsuba print errors alone: its samplers warn each time that they round a number of samples up."""
+    level = mi.log_level()
+    mi.set_log_level(mi.LogLevel.Error)
+    try:
+        yield
+    finally:
+        mi.set_log_level(level)
+
+
+def _round_sample_counts(state: mi.parser.ParserState) -> None:
+    """Replace the numbers of samples of a scene by those that its samplers draw, as they would with a warning each."""
+    for node in state.nodes:
+        if node.type == mi.ObjectType.Sampler and isinstance(node.props.get("sample_count"), int):
+            with no_warnings():
+                sampler = mi.PluginManager.instance().create_object(mi.Properties(node.props))
+            node.props["sample_count"] = sampler.sample_count()
 
 
 def _children(state: mi.parser.ParserState, props: mi.Properties, kind: mi.ObjectType | None = None) -> dict[str, int]:

@@ -1,4 +1,5 @@
 import gc
+import math
 import os
 from itertools import combinations
 from pathlib import Path
@@ -230,15 +231,42 @@ def test_uneven_passes_add_up_to_all_samples(llvm, tmp_path, monkeypatch):
     assert calls[4:] == [0, 1, 2]  # never less than one sample per pixel
 
 
-@pytest.mark.slow
-def test_samplers_that_round_up_are_counted(llvm, tmp_path, monkeypatch):
+# Numbers of samples that each sampler draws without rounding up.
+SIZES = {
+    "independent": lambda n: True,
+    "stratified": lambda n: math.isqrt(n) ** 2 == n,
+    "multijitter": lambda n: n % math.isqrt(n) == 0,
+    "orthogonal": lambda n: math.isqrt(n) ** 2 == n and all(math.isqrt(n) % p for p in range(2, math.isqrt(n))),
+    "ldsampler": lambda n: n in (4, 16, 64, 256, 1024),
+}
+
+
+@pytest.mark.parametrize("kind", SIZES)
+def test_passes_have_sizes_that_the_sampler_draws(llvm, tmp_path, kind, capfd):
+    path = write_scene(tmp_path, CONSTANT, sensor=SENSOR.replace("independent", kind))
+    for width, height in ((8, 8), (512, 340), (768, 576)):
+        scene = load_spectral_scene(path, width=width, height=height)
+        pixels = width * height
+        for spp in (1, 5, 64, 400):
+            samples = passes.split(scene, spp)
+            assert all(map(SIZES[kind], samples))
+            assert sum(samples) == spp or (kind in ("orthogonal", "ldsampler") and 0 < sum(samples) - spp < 4)
+            assert max(samples) * pixels < 2 * max(passes.SAMPLES_PER_PASS, 8 * pixels) + 4 * pixels
+            assert len(samples) <= max(1, 2 * spp * pixels / passes.SAMPLES_PER_PASS) + 4
+    assert capfd.readouterr() == ("", "")
+
+
+def test_a_sampler_that_rounds_up_draws_the_samples_requested(llvm, tmp_path, monkeypatch, capfd):
+    """Also where the number in the scene would be rounded up; Mitsuba warns of neither."""
     monkeypatch.setattr(passes, "SAMPLES_PER_PASS", 64 * 6)
-    path = write_scene(tmp_path, CONSTANT)
-    path.write_text(path.read_text().replace("independent", "stratified"))
+    sampler = '<sampler type="stratified"><integer name="sample_count" value="12"/></sampler>'
+    path = write_scene(tmp_path, CONSTANT, sensor=SENSOR.replace('<sampler type="independent"/>', sampler))
     calls = []
     image = render(path, spp=12, progress=lambda done, total, error: calls.append((done, total)))
-    assert calls == [(0, 18), (9, 18), (18, 18)]
-    assert image.attributes["spp"] == 18
+    assert calls == [(0, 12), (4, 12), (8, 12), (12, 12)]
+    assert image.attributes["spp"] == 12
+    assert capfd.readouterr() == ("", "")
+    assert load_spectral_scene(path).sensors()[0].sampler().sample_count() == 16
 
 
 @pytest.mark.parametrize("kind", ["multijitter", "stratified"])

@@ -18,7 +18,7 @@ from ...color import spectrum_to_XYZ
 from ...errors import RequestError
 from ...progress import Progress, part, silent
 from ...render import SpectralImage
-from ...render.film import check_memory, collect, equal_ranges, pass_seed, rotated, trace_pass
+from ...render.film import check_memory, collect, equal_ranges, pass_seed, rotated, sampler_of, trace_pass
 from ...render.passes import Accumulation, ratio, split
 from ...render.scene import channel_wavelengths, load_spectral_scene, parsed, recorded_range
 from ...settings import VISIBLE
@@ -397,7 +397,7 @@ class Pictures:
         """Shade points of `count` pixels, from `first` on: (5, n), position in the picture and linear sRGB."""
         sensor = self.scene.sensors()[0]
         columns, rows = (int(size) for size in sensor.film().crop_size())
-        sampler = mi.load_dict({"type": "multijitter", "sample_count": samples})
+        sampler = sampler_of(mi.load_dict({"type": "multijitter"}), samples)
         samples = sampler.sample_count()  # rounded up to a product of two similar numbers
         sampler.set_samples_per_wavefront(samples)
         seed = pass_seed(self.seed, 2 * first + half)
