@@ -194,6 +194,14 @@ def test_the_manual_lists_the_parameters_of_the_plugins(llvm):
     assert listed == {(parameter.name, parameter.type, parameter.default) for parameter in known}
 
 
+def test_the_manual_lists_what_rigorous_theory_refuses():
+    from mitsuba_diffraction.bsdf.parameters import _SCALAR_ONLY
+
+    text = (ROOT / "docs" / "plugin.md").read_text()
+    (sentence,) = re.findall(r"rigorous-orders\)\)\. ([^.]*) are refused\.", text)
+    assert set(re.findall(r"`(\w+)`", sentence)) == set(_SCALAR_ONLY)
+
+
 def named_by(path):
     """The object of a dotted name; a function before the module that defines it."""
     found = md

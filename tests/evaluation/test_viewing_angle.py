@@ -27,6 +27,7 @@ from viewing_angle import (
 )
 
 import mitsuba_diffraction as md
+from mitsuba_diffraction.evaluation.realtime_shader.evaluate import relative_radiance
 from mitsuba_diffraction.evaluation.realtime_shader.quirks import Quirks
 from mitsuba_diffraction.settings import Settings
 
@@ -53,6 +54,18 @@ def test_a_flat_mirror_has_the_relative_reflectance_one(llvm):
     found = relative_reflectance(flat, [0, 0, 1], [[0, 0, 1]], COARSE)
     assert found.shape == (1, COARSE.size)
     np.testing.assert_allclose(found, 1, atol=2e-3)  # truncation of the lobes, and E in bytes
+
+
+def test_the_published_reflectance_of_a_flat_mirror_exceeds_one(llvm):
+    """docs/thesis.md: ρ of eq. 3.11 is not within [0, 1], with F as in the code, and less so with F² as in the text."""
+    theta = np.deg2rad(75)
+    wi, wo = (np.array([sign * np.sin(theta), 0, np.cos(theta)]) for sign in (1, -1))
+    ratio = (0.04 + 0.96 * (1 - np.cos(theta)) ** 5) / 0.04  # Schlick's F of index 1.5, relative to normal incidence
+    gain = (1 + wi @ wo) ** 2 / ((wi[2] + wo[2]) ** 2 * wo[2])
+    flat = md.HeightField(np.zeros((8, 8)), 0.05)
+    found = relative_radiance(flat, wi, wo, 550.0, variant="flss", quirks=Quirks.as_published())
+    assert found == pytest.approx(ratio * gain, rel=1e-3)
+    assert [round(float(ratio**power * gain), 2) for power in (1, 2)] == [1.65, 10.5]
 
 
 @pytest.mark.few(1)
