@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import hashlib
 import importlib.util
+import io
 import os
 import re
 import secrets
@@ -74,6 +75,19 @@ def whole_file(path: str | os.PathLike[str]) -> Iterator[Path]:
             os.fsync(folder)
         finally:
             os.close(folder)
+
+
+@contextmanager
+def encoded_file(path: str | os.PathLike[str]) -> Iterator[BinaryIO]:
+    """Yield a buffer named `path`, and write its contents to `path` by `whole_file` if the block succeeds.
+
+    For Pillow, which ignores the bytes that a full disk does not take when it writes to a file itself.
+    """
+    buffer = io.BytesIO()
+    buffer.name = os.fspath(path)  # its suffix selects the format
+    yield buffer
+    with whole_file(path) as temporary:
+        temporary.write_bytes(buffer.getbuffer())
 
 
 @contextmanager

@@ -11,7 +11,7 @@ from PIL import Image
 from scipy.interpolate import interp1d
 
 from ..color import daylight, into_gamut, on_screen, spectrum_to_linear_sRGB
-from ..files import whole_file
+from ..files import encoded_file, whole_file
 from ..outputs import MARK, METADATA
 from ..settings import VISIBLE
 from ..surface.heightfield import HeightField
@@ -41,13 +41,7 @@ def save(design: Design, path: str | os.PathLike[str]) -> tuple[Path, ...]:
     field, plate = design.height_field, design.plate
     with whole_file(paths[0]) as temporary:
         temporary.write_bytes(_simple_field(field))
-    with whole_file(paths[1]) as temporary:
-        counts = np.rint(field.heights / plate.height_range * 65535).astype(np.uint16)
-        scale = (
-            f"{MARK}: {field.source}. Pixel size {field.pixel_size[0]:.6g} µm; height {plate.height_range:g} µm from "
-            "black (0) to white (65535); the top row is at the lowest y"
-        )
-        Image.fromarray(counts).save(temporary, "TIFF", tiffinfo={_IMAGE_DESCRIPTION: scale.replace("µ", "u")})
+    save_tiff(field, plate.height_range, paths[1])
     with whole_file(paths[2]) as temporary:
         temporary.write_text(
             f'# {MARK}: {field.source}\n[surface]\nscan = "{paths[0].name}"\n\n[spectrum]\nextent = "tile"\n'
@@ -56,6 +50,17 @@ def save(design: Design, path: str | os.PathLike[str]) -> tuple[Path, ...]:
         )
     save_picture(design, paths[3])
     return paths
+
+
+def save_tiff(field: HeightField, height_range: float, path: str | os.PathLike[str]) -> None:
+    """Write heights as a 16-bit TIFF, `height_range` in µm from black to white, with its scale in the description."""
+    counts = np.rint(field.heights / height_range * 65535).astype(np.uint16)
+    scale = (
+        f"{MARK}: {field.source}. Pixel size {field.pixel_size[0]:.6g} µm; height {height_range:g} µm from "
+        "black (0) to white (65535); the top row is at the lowest y"
+    )
+    with encoded_file(path) as stream:
+        Image.fromarray(counts).save(stream, "TIFF", tiffinfo={_IMAGE_DESCRIPTION: scale.replace("µ", "u")})
 
 
 def _simple_field(field: HeightField) -> bytes:

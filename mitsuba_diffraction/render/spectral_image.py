@@ -25,9 +25,9 @@ from ..color import (
     spectrum_to_XYZ,
 )
 from ..errors import RequestError
-from ..files import whole_file
+from ..files import encoded_file, whole_file
 from ..outputs import MARK, png_text
-from ..spectrum.exr import one_line, silence
+from ..spectrum.exr import one_line, refuse_incomplete, silence
 
 _LAYOUT_VERSION = "1.0"
 # Radiance is per nm, the unit in the channel names: the authors of the layout and pbrt-v4 omit the nm⁻¹, and
@@ -171,23 +171,25 @@ class SpectralImage:
         # Wavelets compress noise better than ZIP.
         header["compression"] = Imath.Compression(Imath.Compression.PIZ_COMPRESSION)
         # The only writer of OpenEXR that takes a file in blocks of rows.
-        with whole_file(path) as temporary, closing(OpenEXR.OutputFile(str(temporary), header)) as file:
-            row = 0
-            for block in self.blocks():
-                planes = spectrum_to_linear_sRGB(block, self.wavelengths).astype(np.float32)
-                if rgb:
-                    planes = np.clip(planes, -limit, limit)
-                else:
-                    planes = np.concatenate([planes, block if hats is None else block @ hats], axis=-1)
-                if self.alpha is not None:
-                    planes = np.concatenate([planes, self.alpha[row : row + len(block), :, None]], axis=-1)
-                row += len(block)
-                if (value := float(np.abs(planes).max())) > limit:
-                    raise RequestError(
-                        f"half: got radiances up to {value:.4g}, wanted at most {limit:.0f}; float32 holds them"
-                    )
-                planes = planes.astype(kind)
-                file.writePixels({name: planes[..., i].tobytes() for i, name in enumerate(names)}, len(block))
+        with whole_file(path) as temporary:
+            with closing(OpenEXR.OutputFile(str(temporary), header)) as file:
+                row = 0
+                for block in self.blocks():
+                    planes = spectrum_to_linear_sRGB(block, self.wavelengths).astype(np.float32)
+                    if rgb:
+                        planes = np.clip(planes, -limit, limit)
+                    else:
+                        planes = np.concatenate([planes, block if hats is None else block @ hats], axis=-1)
+                    if self.alpha is not None:
+                        planes = np.concatenate([planes, self.alpha[row : row + len(block), :, None]], axis=-1)
+                    row += len(block)
+                    if (value := float(np.abs(planes).max())) > limit:
+                        raise RequestError(
+                            f"half: got radiances up to {value:.4g}, wanted at most {limit:.0f}; float32 holds them"
+                        )
+                    planes = planes.astype(kind)
+                    file.writePixels({name: planes[..., i].tobytes() for i, name in enumerate(names)}, len(block))
+            refuse_incomplete(temporary)
 
     @classmethod
     def load(cls, path: str | os.PathLike[str]) -> SpectralImage:
@@ -304,7 +306,7 @@ def save_preview(
     for name, value in notes.items():
         text.add_text(name, value)
     comment = "\n".join([MARK, *(f"{name}={value}" for name, value in notes.items())])
-    with whole_file(path) as temporary:
+    with encoded_file(path) as stream:
         # Each format ignores the options of the other.
-        Image.fromarray(shown).save(temporary, pnginfo=text, comment=comment, quality=_JPEG_QUALITY, subsampling=0)
+        Image.fromarray(shown).save(stream, pnginfo=text, comment=comment, quality=_JPEG_QUALITY, subsampling=0)
     return exposure

@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from ..files import whole_file
+from ..files import encoded_file
 from ..outputs import MARK
 from .scene import Materials, load_spectral_scene
 
@@ -57,9 +57,9 @@ def save_animation(previews: Iterable[Path], path: str | os.PathLike[str]) -> No
     from PIL import Image
 
     first, *others = (Image.open(preview).convert("RGB") for preview in previews)
-    with whole_file(path) as temporary:
+    with encoded_file(path) as stream:
         first.save(
-            temporary,
+            stream,
             save_all=True,
             append_images=others,
             duration=1000 // _FRAMES_PER_SECOND,

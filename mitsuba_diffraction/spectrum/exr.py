@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import errno
 import io
 import os
 import sys
@@ -64,7 +65,23 @@ def write(
     }
     with whole_file(path) as temporary:
         OpenEXR.File(header, dict(channels)).write(str(temporary))
+        refuse_incomplete(temporary)
         seal(temporary)
+
+
+def refuse_incomplete(path: Path) -> None:
+    """Raise OSError if the last rows of an OpenEXR file are missing: on a full disk its writer may lose them silently.
+
+    The last rows are at the end of the file.
+    """
+    with silence():
+        try:
+            file = OpenEXR.InputFile(str(path))
+            header = file.header()
+            last = header["dataWindow"].max.y
+            file.channel(next(iter(header["channels"])), scanLine1=last, scanLine2=last)
+        except Exception:
+            raise OSError(errno.EIO, "only a part could be written; the disk may be full") from None
 
 
 def read(path: Path, kind: str, version: int, recipe: str | None) -> tuple[dict[str, Any], dict[str, Any]]:

@@ -3,6 +3,7 @@
 import functools
 import json
 import os
+import resource
 import signal
 import subprocess
 import sys
@@ -16,8 +17,12 @@ from PIL import Image
 import mitsuba_diffraction as md
 from mitsuba_diffraction import outputs
 from mitsuba_diffraction.files import is_intact, refuse_unwritable, seal, whole_file
+from mitsuba_diffraction.inverse_design import output
 from mitsuba_diffraction.outputs import check_outputs
 from mitsuba_diffraction.render.scene import files_of_scene
+from mitsuba_diffraction.render.spectral_image import SpectralImage, save_preview
+from mitsuba_diffraction.render.turntable import save_animation
+from mitsuba_diffraction.spectrum import exr
 
 BLAZE = """[surface]
 profile = "blazed"
@@ -346,3 +351,39 @@ def test_names_that_are_not_utf8_are_one_line(command, words):
     assert (code, out) == (2, "")
     assert len(err.splitlines()) == 1
     assert "UTF-8" in err
+
+
+def noise(*shape):
+    return np.random.default_rng(0).random(shape, np.float32)
+
+
+def picture():
+    return SpectralImage(np.linspace(400, 700, 8), noise(20, 20, 8))
+
+
+WRITERS = {
+    "table.exr": lambda path: exr.write(path, "table", 1, {}, {"a": noise(4, 4)}, ""),
+    "picture.exr": lambda path: picture().save(path),
+    **{f"preview{suffix}": lambda path: save_preview(picture(), path) for suffix in (".png", ".jpg", ".tif", ".webp")},
+    "turn.webp": lambda path: save_animation(["frame.png"] * 2, path),
+    "relief.tif": lambda path: output.save_tiff(md.gratings.foil(1.5, 0.2, samples=64), 0.2, path),
+}
+
+
+@pytest.mark.parametrize("name", WRITERS)
+def test_a_full_disk_leaves_no_part_of_a_file(name):
+    """The limit is the size of the file; at a limit below it, libraries may lose the end of a file in silence."""
+    Image.fromarray((255 * noise(40, 40, 3)).astype(np.uint8)).save("frame.png")
+    whole = Path("whole") / name
+    whole.parent.mkdir()
+    WRITERS[name](whole)
+    size, (soft, hard) = whole.stat().st_size, resource.getrlimit(resource.RLIMIT_FSIZE)
+    Path("part").mkdir()
+    for limit in (size - 1, size - 100, size // 2, 10):
+        resource.setrlimit(resource.RLIMIT_FSIZE, (limit, hard))
+        try:
+            with pytest.raises((OSError, RuntimeError)):
+                WRITERS[name](Path("part") / name)
+        finally:
+            resource.setrlimit(resource.RLIMIT_FSIZE, (soft, hard))
+        assert list(Path("part").iterdir()) == []
