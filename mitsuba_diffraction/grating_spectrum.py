@@ -4,8 +4,9 @@ The file is OpenEXR: float32, ZIP, one part, one pixel per diffraction order or 
 
 Channels are named after what they hold: `S(012.2)` is the coefficient of t² on interval 12 of κ. Those of a series of
 the amplitude are `F{u^003}.re` and `.im` (taylor) or `F{T_003}.re` (chebyshev), F_n with u = h/`heightScale`. Rows are
-orders m_y, columns m_x, from −M to M. Numbers in the header are double precision. `energy` is JSON: the table of
-`energy/table.py`. `contentSha256` covers every byte of the file and reveals damage.
+orders m_y, columns m_x, from −M to M. Numbers in the header are double precision. `energy` and `waves` are
+JSON: the table of `energy/table.py`, and the roughness by period (`scalar_theory.Waves`). `contentSha256` covers every
+byte of the file and reveals damage.
 """
 
 from __future__ import annotations
@@ -23,6 +24,7 @@ import numpy as np
 from .energy.table import EnergyTable
 from .errors import RequestError
 from .progress import stage
+from .scalar_theory import Waves
 from .settings import REPRESENTATIONS, Settings
 from .spectrum.exr import doubles, one_line, read, write
 from .spectrum.grids import OrderGrid, SplineGrid
@@ -53,11 +55,16 @@ class GratingSpectrum(PowerSpectrum):
 
     Attributes:
         energy: the table of E, if read from the file; otherwise `energy_table` computes it.
-        warning: why scalar theory is inaccurate for the surface of a recipe, or "".
+        waves: those of the surface of a recipe, from which the error of scalar theory is estimated.
     """
 
     energy: EnergyTable | None = field(default=None, repr=False)
-    warning: str = field(default="", repr=False)
+    waves: Waves | None = field(default=None, repr=False)
+
+    @property
+    def warning(self) -> str:
+        """A sentence if scalar theory is inaccurate in light of the wavelengths of the spectrum, otherwise ""."""
+        return "" if self.waves is None else self.waves.error(self.wavelengths).warning
 
     def energy_table(self) -> EnergyTable:
         """Return the table of E, which bounds the albedo by one; computed at the first call unless read from a file."""
@@ -100,7 +107,7 @@ class GratingSpectrum(PowerSpectrum):
             **{key: getattr(self, name) for name, key in _OTHERS.items()},
             **({} if self.standard_error is None else {"standardError": doubles(self.standard_error)}),
             "units": "lengths in micrometres, wavelengths in nanometres",
-            **({"warning": self.warning} if self.warning else {}),
+            **({} if self.waves is None else {"waves": json.dumps(self.waves.as_plain())}),
             "energy": json.dumps(self.energy_table().as_plain()),
         }
         if isinstance(table, AmplitudeTable):
@@ -153,7 +160,7 @@ class GratingSpectrum(PowerSpectrum):
                 **entries,
                 standard_error=_single(header["standardError"]) if settings.extent == "sample" else None,
                 energy=EnergyTable.from_plain(json.loads(header["energy"])),
-                warning=header.get("warning", ""),
+                waves=Waves.from_plain(json.loads(header["waves"])) if "waves" in header else None,
             )
         except KeyError as error:
             raise RequestError(f"{path}: a damaged spectrum, {error} is missing") from None

@@ -53,7 +53,7 @@ from .materials import is_file
 from .precomputation import Spectrum, build_spectrum, load_spectrum
 from .progress import Progress, no_progress, part, silent, stage
 from .rigorous import build as rigorous
-from .scalar_theory import scalar_error
+from .scalar_theory import scalar_waves
 from .settings import Settings
 from .surface.gratings import COHERENCE_LENGTHS, PATCHES, PROFILES
 from .surface.heightfield import HeightField
@@ -70,7 +70,7 @@ _SPECTRUM_KEYS = frozenset(f.name for f in fields(Settings))
 REQUESTED = "representation", "terms", "heights_from", "tolerance"  # of a spectrum; they may override a recipe's
 _OF_PROFILE = "coherence_length", "largest_height_range", *REQUESTED
 # Incremented when the same input gives a different result, to invalidate the cache.
-_BUILD_VERSION = 9
+_BUILD_VERSION = 10
 # Spectra in the package (precompute/ready_spectra.py), named as in the cache.
 READY_SPECTRA = Path(__file__).parent / "data" / "spectra"
 _HEIGHTS_TIME_FRACTION = 0.3  # of the build, spent on the heights of several patches, roughly
@@ -248,7 +248,7 @@ class Recipe:
         report = part(progress, _HEIGHTS_TIME_FRACTION if len(patches) > 1 else 0, 1)
         spectrum = build_spectrum(patches, self.settings, report)
         if isinstance(spectrum, GratingSpectrum):
-            spectrum = replace(spectrum, warning=scalar_error(patches[0], spectrum.extent).warning)
+            spectrum = replace(spectrum, waves=scalar_waves(patches[0], spectrum.extent, spectrum.wavelengths))
         return spectrum
 
     def digest(self) -> str:

@@ -9,8 +9,8 @@ from __future__ import annotations
 
 import functools
 import json
-from collections.abc import Callable
-from dataclasses import dataclass
+from collections.abc import Callable, Sequence
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -40,8 +40,10 @@ MAP = Path(__file__).parent / "data" / "scalar_error.json"
 # Conditions under which the error of a surface is reported; the map is the same for ±20°.
 INDEX = 1.5
 ANGLES = (0.0, 20.0, -20.0)  # of incidence, degrees
-WAVELENGTHS = (0.45, 0.55, 0.65)  # µm
-CONDITIONS = "mean over 450–650 nm and 0–20°, n = 1.5"
+WAVELENGTHS = (0.45, 0.55, 0.65)  # µm, of visible light
+_PARTS = (1 / 6, 1 / 2, 5 / 6)  # of another range of wavelengths: the middles of its thirds
+_MIN_POWER = 1e-9  # of a wave, as a fraction of all
+_WAVES_PER_OCTAVE = 16  # of period, into which the waves of a surface are sorted
 
 MAX_TRUSTED_ERROR = 0.1  # above which a surface is considered outside the range of scalar theory
 # R.m.s. factor between the error estimated from the map and that of 48 solved profiles; docs/validation.md.
@@ -298,19 +300,21 @@ def expected_error(
 
 @dataclass(frozen=True)
 class ScalarError:
-    """The error of scalar theory for one surface: the mean over `ANGLES` and `WAVELENGTHS`, for n = 1.5.
+    """The error of scalar theory for one surface: the mean over `ANGLES` and some wavelengths, for n = 1.5.
 
     Attributes:
         share: Σ|Δη_m| as a fraction of the reflected power; infinite outside the stored map (depths above 2 λ).
         transmitted: the same for transmitted light.
         estimated: whether it is from the stored map, within about `ESTIMATE_FACTOR`, instead of solved for the surface.
         remedy: the alternative to scalar theory for this surface.
+        wavelengths: of which it is the mean, in air, µm.
     """
 
     share: float
     transmitted: float
     estimated: bool
     remedy: str
+    wavelengths: tuple[float, ...]
 
     @property
     def bound(self) -> float:
@@ -323,46 +327,136 @@ class ScalarError:
         return f"scalar theory: {self}; {self.remedy}" if self.share > self.bound else ""
 
     def __str__(self) -> str:
+        first, last = (f"{1e3 * wavelength:.0f}" for wavelength in (self.wavelengths[0], self.wavelengths[-1]))
+        light = f"{first} nm" if first == last else f"{first}–{last} nm"
         if not np.isfinite(self.share):
-            return "error unknown, the surface is deeper than two wavelengths"
+            return f"error unknown, the surface is deeper than two wavelengths ({light})"
         about = "about " if self.estimated else ""
         reflected, transmitted = (f"{float(f'{100 * error:.2g}'):g}%" for error in (self.share, self.transmitted))
-        return f"errs by {about}{reflected} of the reflected light, {transmitted} of the transmitted ({CONDITIONS})"
+        conditions = f"mean over {light} and 0–{max(ANGLES):g}°, n = {INDEX:g}"
+        return f"errs by {about}{reflected} of the reflected light, {transmitted} of the transmitted ({conditions})"
 
 
-def scalar_error(height_field: HeightField, extent: str = "tile") -> ScalarError:
+@dataclass(frozen=True)
+class Waves:
+    """The waves in the heights of a surface, from which the error of scalar theory is estimated for any light.
+
+    Attributes:
+        depth: of the sinusoid of equal roughness, µm.
+        periods: µm, (n,).
+        power: the fraction of the variance of each, (n,).
+        width: of a profile along x, to which rigorous theory applies, µm; None of other surfaces.
+        solved: the error of such a profile, solved for one light.
+    """
+
+    depth: float
+    periods: tuple[float, ...]
+    power: tuple[float, ...]
+    width: float | None = None
+    solved: ScalarError | None = None
+
+    @classmethod
+    def of(cls, height_field: HeightField, extent: str) -> Waves:
+        """Determine the waves of a surface; a "sample" is levelled first."""
+        frequencies, power, rms_height = height_spectrum(height_field, extent)
+        kept = power > _MIN_POWER * power.sum()
+        steps = np.rint(_WAVES_PER_OCTAVE * np.log2(1 / np.maximum(frequencies[kept], 1e-12)))
+        found, where = np.unique(steps, return_inverse=True)
+        sums = np.bincount(where, power[kept]) / max(power.sum(), 1e-300)
+        periods = 2 ** (found / _WAVES_PER_OCTAVE)
+        width = height_field.tile_size[0] if extent == "tile" and is_profile(height_field) else None
+        return cls(float(equivalent_depth(rms_height)), tuple(periods.tolist()), tuple(sums.tolist()), width)
+
+    def error(self, light: tuple[float, float] = VISIBLE, index: float = 1.0) -> ScalarError:
+        """Return the error in light of (shortest, longest) wavelengths, nm, in a medium of an index above the surface.
+
+        The map is averaged over the waves, each weighted by its fraction of the variance, at the depth of the sinusoid
+        of equal roughness. Periods outside the map take the value at its boundary.
+        """
+        wavelengths = wavelengths_of(light)
+        if self.solved is not None and self.solved.wavelengths == wavelengths and index == 1:
+            return self.solved
+        inside = [wavelength / index for wavelength in wavelengths]
+        share, transmitted = (self._estimated(name, inside) for name in ("dielectric", "transmitted"))
+        return ScalarError(share, transmitted, True, self._remedy(light[0] * 1e-3 / index), wavelengths)
+
+    def _estimated(self, material: str, wavelengths: Sequence[float]) -> float:
+        """Return the mean error over wavelengths in µm; infinite for too large a depth."""
+        if self.depth == 0:
+            return 0.0
+        nodes, total = error_map()[0], 0.0
+        for wavelength in wavelengths:
+            depth = self.depth / wavelength
+            errors = [expected_error(node, depth, 1.0, material=material, mean=True) for node in nodes]
+            if not np.isfinite(errors).all():
+                return float("inf")
+            of_waves = np.interp(np.log(np.divide(self.periods, wavelength)), np.log(nodes), np.log(errors))
+            total += float(np.exp(of_waves) @ self.power)
+        return total / len(wavelengths)
+
+    def _remedy(self, shortest: float) -> str:
+        max_period = MAX_PERIOD_IN_WAVELENGTHS * shortest
+        if self.width is None:
+            return "no rigorous theory is offered for a surface that varies along y"
+        if self.width > max_period:
+            return f"rigorous theory is offered for tiles of up to {max_period:.2g} µm along x"
+        return "theory=rigorous has it right"
+
+    def as_plain(self) -> dict[str, Any]:
+        """Return the waves as JSON types."""
+        return asdict(self)
+
+    @classmethod
+    def from_plain(cls, content: dict[str, Any]) -> Waves:
+        """Return the waves that `as_plain` wrote."""
+        content = {name: tuple(value) if isinstance(value, list) else value for name, value in content.items()}
+        if (solved := content.pop("solved")) is not None:
+            solved = ScalarError(**{**solved, "wavelengths": tuple(solved["wavelengths"])})
+        return cls(**content, solved=solved)
+
+
+def wavelengths_of(light: tuple[float, float]) -> tuple[float, ...]:
+    """Return the wavelengths in µm at which the error is determined for light of (shortest, longest) ones in nm."""
+    first, last = light
+    if (first, last) == VISIBLE:
+        return WAVELENGTHS
+    return tuple(sorted({1e-3 * (first + (last - first) * part) for part in _PARTS}))
+
+
+def scalar_waves(height_field: HeightField, extent: str = "tile", light: tuple[float, float] = VISIBLE) -> Waves:
+    """Determine the waves of a surface, and solve profiles to which rigorous theory applies for the light in nm."""
+    waves, wavelengths = Waves.of(height_field, extent), wavelengths_of(light)
+    if waves.width is None or waves.width > MAX_PERIOD_IN_WAVELENGTHS * light[0] * 1e-3:
+        return waves
+    # Deeper profiles take long to solve, and are far outside the range.
+    if waves.depth > wavelengths[0]:
+        return waves
+    solved = _solved_error(height_field, wavelengths) if waves.depth > 0 else (0.0, 0.0)
+    if not np.isfinite(solved[0]):
+        return waves
+    return replace(waves, solved=ScalarError(*solved, False, waves.error(light).remedy, wavelengths))
+
+
+def scalar_error(height_field: HeightField, extent: str = "tile", light: tuple[float, float] = VISIBLE) -> ScalarError:
     """Determine the error of scalar theory for a surface; a "sample" is levelled first.
 
-    Periodic profiles to which rigorous theory applies are solved. For any other surface, the map is averaged over the
-    waves in the spectrum of its heights, each weighted by its fraction of the variance, at the depth of the sinusoid of
-    equal roughness. Periods outside the map take the value at its boundary.
+    Periodic profiles to which rigorous theory applies are solved. For any other surface it is estimated (`Waves`).
+
+    Args:
+        height_field: the surface.
+        extent: "tile" or "sample".
+        light: (shortest, longest) wavelengths, nm.
     """
-    lengths, power, rms_height = height_spectrum(height_field, extent)
-    depth = equivalent_depth(rms_height)
-    max_period = MAX_PERIOD_IN_WAVELENGTHS * VISIBLE[0] * 1e-3
-    solved = float("nan"), float("nan")
-    if not (extent == "tile" and is_profile(height_field)):
-        remedy = "no rigorous theory is offered for a surface that varies along y"
-    elif height_field.tile_size[0] > max_period:
-        remedy = f"rigorous theory is offered for tiles of up to {max_period:.2g} µm along x"
-    else:
-        remedy = "theory=rigorous has it right"
-        # Deeper profiles take long to solve, and are far outside the range.
-        if depth <= WAVELENGTHS[0]:
-            solved = _solved_error(height_field) if depth > 0 else (0.0, 0.0)
-    if np.isfinite(solved[0]):
-        return ScalarError(*solved, False, remedy)
-    reflected, transmitted = (_estimated_error(lengths, power, depth, name) for name in ("dielectric", "transmitted"))
-    return ScalarError(reflected, transmitted, True, remedy)
+    return scalar_waves(height_field, extent, light).error(light)
 
 
-def _solved_error(profile: HeightField) -> tuple[float, float]:
+def _solved_error(profile: HeightField, wavelengths: Sequence[float]) -> tuple[float, float]:
     """Compute the mean error of reflected and of transmitted light; NaN if the solver does not converge."""
     period = profile.tile_size[0]
     row = HeightField(profile.heights[:1], profile.pixel_size)
     powers, curve = profile_powers(row), curve_of(row)
     errors = []
-    for wavelength in WAVELENGTHS:
+    for wavelength in wavelengths:
         for angle in ANGLES:
             omega_i = np.array([-np.sin(np.deg2rad(angle)), 0.0, np.cos(np.deg2rad(angle))])
             exact = converge(curve, omega_i, period / wavelength, INDEX, _MAX_SOLVER_ERROR)
@@ -380,18 +474,3 @@ def _solved_error(profile: HeightField) -> tuple[float, float]:
             )
     reflected, transmitted_ = np.mean(errors, axis=0)
     return float(reflected), float(transmitted_)
-
-
-def _estimated_error(lengths: Array, power: Array, depth: float, material: str) -> float:
-    """Return the mean of the map over waves of these |q|, cycles/µm, and powers; infinite for too large a depth."""
-    if depth == 0:
-        return 0.0
-    nodes = error_map()[0]
-    mean = np.zeros_like(power)
-    for wavelength in WAVELENGTHS:
-        errors = [expected_error(node, depth / wavelength, 1.0, material=material, mean=True) for node in nodes]
-        if not np.isfinite(errors).all():
-            return float("inf")
-        waves = -np.log(np.maximum(lengths, 1e-12) * wavelength)
-        mean += np.exp(np.interp(waves, np.log(nodes), np.log(errors))) / len(WAVELENGTHS)
-    return float((power * mean).sum() / power.sum())

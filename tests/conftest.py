@@ -89,10 +89,10 @@ def results_of_a_session():
             energies[key] = energy_of(spectrum, ratios, stack, laterals)
         return energies[key]
 
-    def error(profile):
-        key = profile.heights[:1].tobytes(), profile.pixel_size
+    def error(profile, wavelengths):
+        key = profile.heights[:1].tobytes(), profile.pixel_size, wavelengths
         if key not in errors:
-            errors[key] = solved_error(profile)
+            errors[key] = solved_error(profile, wavelengths)
         return errors[key]
 
     with pytest.MonkeyPatch.context() as patch:

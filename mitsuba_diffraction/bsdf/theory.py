@@ -156,9 +156,6 @@ class ScalarTheory(Theory):
     """
 
     def __init__(self, spectrum: GratingSpectrum, request: GratingRequest) -> None:
-        if spectrum.warning:
-            of_glass = "" if request.material.transparent else "; this is the error of glass, that of metals differs"
-            _warn_of_range(spectrum.source, spectrum.warning + of_glass)
         self.spectrum, self.media, self.scales = spectrum, request.media, request.scales
         self.material, self.shadowing = request.material, request.shadowing
         self.conserve_energy = request.conserve_energy
@@ -199,6 +196,11 @@ class ScalarTheory(Theory):
         self.interface = self._interface()
         shortest, longest = self.spectrum.wavelengths
         self.wavelengths, self.light = (shortest * index, longest * index), light
+        if light and self.spectrum.waves is not None:
+            outside = index if self.media.eta is None else self.media.outside
+            if warning := self.spectrum.waves.error(light, outside).warning:
+                of_glass = "" if self.material.transparent else "; this is the error of glass, that of metals differs"
+                _warn_of_range(self.spectrum.source, warning + of_glass)
 
     def _films_changed(self) -> bool:
         """Return whether films differ from those of the tables by more than `MAX_FILM_CHANGE`."""

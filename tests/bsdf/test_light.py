@@ -6,6 +6,7 @@ import pytest
 from bsdf_support import albedo, direction, plugin
 
 import mitsuba_diffraction as md
+from mitsuba_diffraction.settings import Settings
 
 WAVELENGTHS = (450.0, 530.0, 600.0, 700.0)
 PROFILE = {"type": "diffraction_grating", "profile": "sinusoidal", "period": 2.5, "depth": 0.25}
@@ -174,3 +175,22 @@ def test_visible_light_outside_a_saved_spectrum_is_refused_once_it_is_there(llvm
 def test_a_scene_without_a_sensor_is_refused_by_mitsuba(llvm):
     with pytest.raises(Exception, match="No sensor specified"):
         mi.render(mi.load_dict({"type": "scene", "integrator": {"type": "path"}, "shape": {"type": "sphere"}}))
+
+
+def test_the_error_of_scalar_theory_is_that_of_the_light_and_logged_once(llvm, caplog):
+    relief = {"profile": "crossed", "period": 2.5, "depth": 0.35, "samples": 64}
+    settings = Settings(coherence_length=4.0, wavelengths=(240.0, 830.0), tolerance=0.1)
+    fine = {"type": "diffraction_grating", "spectrum": md.Recipe(relief, settings).build(), "conserve_energy": False}
+
+    def warnings_of(film=None, **parameters):
+        caplog.clear()
+        mi.load_dict(scene({**fine, "material": "none", **parameters}, film))
+        return [message for record in caplog.records if "scalar theory" in (message := record.getMessage())]
+
+    assert warnings_of() == []  # 12 % in visible light, within the range
+    (infrared,) = warnings_of((1500.0, 1600.0))
+    assert "scalar theory: errs by about 16% of the reflected light" in infrared
+    assert "(mean over 1517–1583 nm and 0–20°, n = 1.5)" in infrared
+    assert "this is the error of glass, that of metals differs" in infrared
+    assert warnings_of((1500.0, 1600.0)) == []
+    assert warnings_of((1500.0, 1600.0), coat_ior=1.5) == []  # 1000 to 1067 nm in the coat

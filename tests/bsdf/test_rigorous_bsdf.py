@@ -401,17 +401,6 @@ def test_a_grating_is_built_for_the_coat_and_the_variant_of_the_scene(monkeypatc
     ]
 
 
-@pytest.mark.slow
-def test_inaccurate_scalar_theory_is_logged_once(llvm, caplog):
-    fine = {"type": "diffraction_grating", "profile": "sinusoidal", "period": 0.71, "depth": 0.3, "samples": 64}
-    for _ in range(2):
-        mi.load_dict({**fine, "material": "Al"})
-    mi.load_dict({**fine, "period": 3.0, "depth": 0.05, "material": "Al"})
-    said = "".join(record.getMessage() for record in caplog.records)
-    assert said.count("scalar theory: errs by") == 1
-    assert "theory=rigorous has it right; this is the error of glass, that of metals differs" in said
-
-
 def test_precompute_warns_of_inaccurate_scalar_theory(command, tmp_path):
     recipe = tmp_path / "fine.toml"
     recipe.write_text('[surface]\nprofile = "sinusoidal"\nperiod = 0.71\ndepth = 0.3\nsamples = 64\n')

@@ -2,6 +2,7 @@
 
 import importlib
 import json
+import re
 from pathlib import Path
 
 import mitsuba as mi
@@ -171,7 +172,7 @@ def test_a_surface_outside_the_range_of_scalar_theory_is_reported():
     assert "errs by about" in crossed
     assert crossed.endswith("no rigorous theory is offered for a surface that varies along y")
     deep = scalar_theory.scalar_error(md.gratings.sinusoidal(4.0, 1.5)).warning
-    assert deep.startswith("scalar theory: error unknown, the surface is deeper than two wavelengths; ")
+    assert deep.startswith("scalar theory: error unknown, the surface is deeper than two wavelengths (450–650 nm); ")
     assert deep.endswith("for tiles of up to 3.6 µm along x")
     for flat in (md.HeightField(np.zeros((1, 8)), 0.1), md.HeightField(np.full((8, 8), 0.7), 0.1)):
         for extent in ("tile", "sample"):
@@ -207,6 +208,32 @@ def test_error_of_a_profile_is_that_of_coupled_waves(monkeypatch):
     found = scalar_theory.scalar_error(md.gratings.blazed(2.5, 0.25))
     assert not found.estimated
     assert found.share == pytest.approx(np.mean(stored), abs=0.005)
+
+
+@pytest.mark.parametrize("scale", [0.5, 20.0])
+@pytest.mark.parametrize("surface", [md.gratings.crossed(1.6, 0.3, samples=32), md.gratings.blazed(2.5, 0.25)])
+def test_the_error_depends_on_lengths_in_wavelengths(surface, scale):
+    """Maxwell's equations have no length of their own."""
+    light = (500.0, 620.0)
+    larger = md.HeightField(scale * surface.heights, np.multiply(scale, surface.pixel_size))
+    found, expected = (
+        scalar_theory.scalar_error(field, light=(light[0] * k, light[1] * k))
+        for field, k in ((larger, scale), (surface, 1.0))
+    )
+    assert found.estimated == expected.estimated
+    # Waves are sorted into sixteenths of an octave.
+    assert found.share == pytest.approx(expected.share, rel=0.02)
+    assert scalar_theory.scalar_error(larger).share != pytest.approx(expected.share, rel=0.2)
+
+
+def test_a_relief_for_infrared_light_is_not_judged_by_visible_light():
+    deep = md.gratings.crossed(40.0, 4.0, samples=32)
+    assert "deeper than two wavelengths (450–650 nm)" in scalar_theory.scalar_error(deep).warning
+    assert scalar_theory.scalar_error(deep, light=(10600.0, 10600.0)).warning == ""
+    fine = md.gratings.crossed(2.5, 0.35, samples=32)
+    assert scalar_theory.scalar_error(fine).warning == ""
+    found = scalar_theory.scalar_error(fine, light=(1550.0, 1550.0))
+    assert re.search(r"errs by about \d+% of the reflected light, .* \(mean over 1550 nm and 0–20°", found.warning)
 
 
 def random_profiles(count):
