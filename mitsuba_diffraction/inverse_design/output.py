@@ -13,7 +13,7 @@ from scipy.interpolate import interp1d
 from ..color import daylight, into_gamut, on_screen, spectrum_to_linear_sRGB
 from ..files import encoded_file, whole_file
 from ..outputs import MARK, METADATA
-from ..settings import VISIBLE
+from ..settings import VISIBLE, Settings
 from ..surface.heightfield import HeightField
 from .far_field import Array
 from .result import Design
@@ -43,13 +43,24 @@ def save(design: Design, path: str | os.PathLike[str]) -> tuple[Path, ...]:
         temporary.write_bytes(_simple_field(field))
     save_tiff(field, plate.height_range, paths[1])
     with whole_file(paths[2]) as temporary:
-        temporary.write_text(
-            f'# {MARK}: {field.source}\n[surface]\nscan = "{paths[0].name}"\n\n[spectrum]\nextent = "tile"\n'
-            f"coherence_length = {plate.coherence_length:.6g}\ntolerance = {_RECIPE_TOLERANCE}\n",
-            encoding="utf-8",
-        )
+        temporary.write_text(_recipe(design, paths[0].name), encoding="utf-8")
     save_picture(design, paths[3])
     return paths
+
+
+def _recipe(design: Design, scan: str) -> str:
+    """Return the contents of the recipe of a relief in the file `scan`."""
+    plate, deepest = design.plate, float(f"{np.ptp(design.height_field.heights) * 1.01:.3g}")
+    settings = {
+        "extent": '"tile"',
+        "coherence_length": f"{plate.coherence_length:.6g}",
+        "tolerance": f"{_RECIPE_TOLERANCE}",
+        **({} if plate.light == VISIBLE else {"wavelengths": f"[{plate.light[0]:.1f}, {plate.light[1]:.1f}]"}),
+        **({"largest_height_range": f"{deepest}"} if deepest > Settings().largest_height_range else {}),
+    }
+    lines = [f"{name} = {value}" for name, value in settings.items()]
+    head = f'# {MARK}: {design.height_field.source}\n[surface]\nscan = "{scan}"\n\n[spectrum]\n'
+    return head + "\n".join(lines) + "\n"
 
 
 def save_tiff(field: HeightField, height_range: float, path: str | os.PathLike[str]) -> None:

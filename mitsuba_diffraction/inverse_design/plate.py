@@ -8,9 +8,12 @@ from dataclasses import dataclass
 import numpy as np
 
 from ..errors import RequestError, check_whole, is_number
+from ..settings import MIN_WAVELENGTH, VISIBLE
 from .far_field import Array, blurred_texels
 
 _MAX_TEXELS = 256
+_MAX_PATH = 16.0  # largest path difference in wavelengths; deeper reliefs are far outside of scalar theory
+_MARGIN = 1.2  # of the wavelengths of invisible light, by which its spectrum covers more than the design
 
 
 @dataclass(frozen=True, eq=False)
@@ -45,6 +48,17 @@ class Plate:
             raise RequestError(f"int_ior: got {self.int_ior!r}, wanted an index above 1, or none for a mirror")
         if self.levels is not None:
             check_whole("levels", self.levels, 2)
+        if self.tool_blur > self.texel:
+            raise RequestError(
+                f"tool_blur: got {self.tool_blur:g} µm with texels of {self.texel:g} µm, wanted at most a texel: a "
+                "wider tool leaves hardly anything of them"
+            )
+        deepest = self.height_range * _MAX_PATH / self.path
+        if self.height_range > deepest:
+            raise RequestError(
+                f"height_range: got {self.height_range:g} µm, a path difference of {self.path:.3g} wavelengths; wanted "
+                f"at most {deepest:.3g} µm, {_MAX_PATH:g} wavelengths"
+            )
         longest = float(self.wavelengths.max()) * 1e-3
         sine = math.sin(math.radians(self.angle))
         if self.texel <= longest / 2:
@@ -92,6 +106,22 @@ class Plate:
         sine = math.sin(math.radians(self.angle)) / 2
         path = 1 + math.sqrt(1 - sine**2) if self.int_ior is None else 1 - math.sqrt(self.int_ior**2 - sine**2)
         return 2 * np.pi * path / (self.wavelengths * 1e-3)
+
+    @property
+    def path(self) -> float:
+        """The path difference between the lowest and the highest texel, in wavelengths, at most."""
+        return float(np.abs(self.kappa).max()) * self.height_range / (2 * np.pi)
+
+    @property
+    def light(self) -> tuple[float, float]:
+        """(shortest, longest) wavelengths, nm, for which relief and spectrum are made: visible light, unless others."""
+        shortest, longest = float(self.wavelengths.min()), float(self.wavelengths.max())
+        if shortest >= VISIBLE[0] and longest <= VISIBLE[1]:
+            return VISIBLE
+        shortest, longest = max(shortest / _MARGIN, MIN_WAVELENGTH), longest * _MARGIN
+        if longest < VISIBLE[0] or shortest > VISIBLE[1]:
+            return shortest, longest
+        return min(shortest, VISIBLE[0]), max(longest, VISIBLE[1])
 
     def edges(self, bins: int) -> Array:
         """Return the edges of bins of equal width across the picture, in direction cosines, (bins + 1,)."""

@@ -15,7 +15,7 @@ from ..surface.heightfield import HeightField
 from .far_field import Array, lobes_in_bins
 from .plate import Plate
 
-_PIXEL = 0.09  # µm, at most: resolves all frequencies that visible light reaches; in a sheet divided by its index
+_PIXEL = 1 / 4  # of the shortest wavelength, at most: resolves all frequencies that light reaches
 _BRIGHT = 0.1  # of the maximum of a target: what is brighter is in the target
 # Of its making: factors of the heights and of the tool's blur.
 _ERRORS = {"depth −5 %": (0.95, 1.0), "depth +5 %": (1.05, 1.0), "blur −20 %": (1.0, 0.8), "blur +20 %": (1.0, 1.2)}
@@ -83,7 +83,7 @@ class Design:
     @property
     def warning(self) -> str:
         """A sentence if the relief is outside the range of scalar theory, otherwise ""."""
-        return scalar_error(self.height_field).warning
+        return scalar_error(self.height_field, light=(self.wavelengths.min(), self.wavelengths.max())).warning
 
     def efficiencies(self, wavelengths: Array) -> Array:
         """Return the fraction of the light in the target at other wavelengths in nm, (n,).
@@ -96,8 +96,9 @@ class Design:
 
 
 def _relief(heights: Array, plate: Plate, blur_scale: float = 1.0) -> HeightField:
-    """Return one period of the relief, in pixels of at most `_PIXEL`."""
-    per_texel = max(4, math.ceil(plate.texel / _PIXEL * (plate.int_ior or 1.0)))
+    """Return one period of the relief, in pixels of at most `_PIXEL`; inside a sheet wavelengths are shorter."""
+    pixel = _PIXEL * plate.light[0] * 1e-3 / (plate.int_ior or 1.0)
+    per_texel = max(4, math.ceil(plate.texel / pixel))
     spread = plate.spread(per_texel, blur_scale)
     source = f"design of {plate.texels} × {plate.texels} texels of {plate.texel:g} µm"
     return HeightField(spread @ heights @ spread.T, plate.texel / per_texel, source)

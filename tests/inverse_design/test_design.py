@@ -1,11 +1,17 @@
 """Designs: what the BSDF and the precomputed spectrum say of them, and requests that are refused."""
 
+import warnings
+
 import numpy as np
 import pytest
 
 import mitsuba_diffraction as md
 from mitsuba_diffraction.inverse_design import Design
+from mitsuba_diffraction.inverse_design.build import wanted_fractions
 from mitsuba_diffraction.inverse_design.far_field import nearest_levels
+from mitsuba_diffraction.inverse_design.output import save
+from mitsuba_diffraction.inverse_design.plate import Plate
+from mitsuba_diffraction.recipe import Recipe
 
 SMALL = {"texel": 1.0, "texels": 16, "starts": 6}
 
@@ -146,6 +152,43 @@ def test_white_light_is_directed_at_all_wavelengths():
     assert between.min() > 0.95 * found.efficiency.min()
 
 
+def unsearched(wavelengths, **options):
+    """A design of random heights."""
+    plate = Plate(
+        **{"texel": 1.0, "texels": 12, "height_range": 0.8, "angle": 17.5, "tool_blur": 0.13, **options},
+        wavelengths=np.atleast_1d(np.asarray(wavelengths, float)),
+        **{"int_ior": None, "levels": None},
+    )
+    heights = np.random.default_rng(0).uniform(0, plate.height_range, 2 * (plate.texels,))
+    return Design.of(heights, plate, wanted_fractions(lopsided(), plate))
+
+
+def test_a_design_in_infrared_is_that_of_shorter_light_in_larger_lengths():
+    """Scalar theory has no length of its own."""
+    near = unsearched(1060, texel=1.6, height_range=1.6)
+    far = unsearched(10600, texel=16, height_range=16, tool_blur=1.3)
+    assert far.height_field.shape == near.height_field.shape
+    assert far.height_field.heights == pytest.approx(10 * near.height_field.heights)
+    assert far.predicted == pytest.approx(near.predicted, abs=1e-12)
+    assert far.height_field.pixel_size[0] > 10.6 / 6
+    assert "deeper than two wavelengths" not in far.warning
+
+
+def test_the_recipe_of_a_deep_relief_for_infrared_light_is_accepted(tmp_path):
+    design = unsearched(10600, texel=8, texels=10, height_range=25)
+    save(design, tmp_path / "plate.gsf")
+    recipe = Recipe.load(tmp_path / "plate.toml", tolerance=0.2)
+    assert recipe.settings.wavelengths[0] < 10600 < recipe.settings.wavelengths[1]
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", UserWarning)  # heights of more than 20 µm, which are rare
+        assert recipe.build().height_range == pytest.approx(np.ptp(design.height_field.heights))
+
+
+def test_a_relief_too_fine_for_infrared_light_is_warned_of():
+    """Texels of 0.52 λ."""
+    assert "(mean over 1550 nm and 0–20°, n = 1.5)" in unsearched(1550, texel=0.8, texels=16).warning
+
+
 @pytest.mark.slow
 @pytest.mark.parametrize("size", [0.4, 0.55, 0.75])
 def test_the_default_plate_casts_compact_pictures(size):
@@ -179,6 +222,8 @@ CENTRE[31:34, 31:34] = 1
         (np.eye(8), {"texels": 5}, "texels: got 5 of 0.8 µm, wanted a period of at least 4.46 µm"),
         (np.eye(8), {"texels": 32.5}, "texels: got 32.5, wanted a whole number"),
         (np.eye(8), {"height_range": 0}, "height_range: got 0, wanted a positive number of µm"),
+        (np.eye(8), {"height_range": 800}, "height_range: got 800 µm, .* wanted at most 3.46 µm, 16 wavelengths"),
+        (np.eye(8), {"tool_blur": 1}, "tool_blur: got 1 µm with texels of 0.8 µm, wanted at most a texel"),
         (np.eye(8), {"tool_blur": -1}, "tool_blur: got -1, wanted a number of µm"),
         (np.eye(8), {"angle": 50}, "angle: got 50, wanted degrees above 0 and below 45"),
         (np.eye(8), {"wavelengths": 0.532}, "wavelengths: got 0.532, wanted one or several in nm"),
