@@ -12,7 +12,7 @@ from PIL import Image, ImageOps
 
 from ..errors import RequestError
 from ..files import refuse_special
-from ..inverse_design import Design
+from ..inverse_design import Design, Verdict
 from ..inverse_design import design as search
 from ..inverse_design.output import SUFFIXES, save
 from ..outputs import check_outputs, free_name
@@ -77,8 +77,11 @@ def design(
         f"{field.pixel_size[0] * 1e3:.4g} nm, {height_range:g} µm from black to white; its top row is at the lowest "
         f"y\n{recipe}: its recipe, for scenes\n{figure}: target, prediction and relief"
     )
-    if found.warning:
-        tell(f"! {found.warning}")
+    verdict = Verdict.of(found)
+    for warning in filter(None, [found.warning, "" if verdict.grade == "good" else str(verdict)]):
+        tell(f"! {warning}")
+    if verdict.grade == "good":
+        tell(str(verdict))
     if found.interrupted:
         raise Stopped(f"{relief} holds the best relief so far")
 

@@ -2,5 +2,6 @@
 
 from .build import design
 from .result import Design
+from .verdict import Verdict
 
-__all__ = ["Design", "design"]
+__all__ = ["Design", "Verdict", "design"]

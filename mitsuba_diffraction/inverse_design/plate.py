@@ -48,10 +48,10 @@ class Plate:
             raise RequestError(f"int_ior: got {self.int_ior!r}, wanted an index above 1, or none for a mirror")
         if self.levels is not None:
             check_whole("levels", self.levels, 2)
-        if self.tool_blur > self.texel:
+        if self.tool_blur > self.period / 8:
             raise RequestError(
-                f"tool_blur: got {self.tool_blur:g} µm with texels of {self.texel:g} µm, wanted at most a texel: a "
-                "wider tool leaves hardly anything of them"
+                f"tool_blur: got {self.tool_blur:g} µm, wanted at most an eighth of the period, {self.period / 8:.3g} "
+                "µm: a wider tool makes a flat plate"
             )
         deepest = self.height_range * _MAX_PATH / self.path
         if self.height_range > deepest:

@@ -69,6 +69,18 @@ class Design:
         return _efficiency(self.predicted, self.wanted)
 
     @property
+    def light(self) -> float:
+        """The mean of `efficiency`."""
+        return float(self.efficiency.mean())
+
+    @property
+    def contrast(self) -> float:
+        """The mean of (L − L₀)/(L + L₀), L and L₀ the mean radiances in the target and beside it in the frame."""
+        pairs = zip(self.predicted, self.inside, strict=True)
+        radiances = [(p[i].mean(), p[~i].mean() if not i.all() else 0.0) for p, i in pairs]
+        return float(np.mean([(bright - dark) / (bright + dark) for bright, dark in radiances]))
+
+    @property
     def correlation(self) -> Array:
         """Pearson's correlation of wanted and predicted light over the bins, (w,)."""
         pairs = zip(self.wanted, self.predicted, strict=True)

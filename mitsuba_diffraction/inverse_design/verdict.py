@@ -1,0 +1,89 @@
+"""Whether a plate works, in one line, from thresholds; if not, what would help."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+
+from .plate import Plate
+from .result import Design
+
+# Fraction of the light in the picture, contrast, correlation with the target: at least these, means over wavelengths.
+GOOD = (0.6, 0.6, 0.85)
+VISIBLE = (0.3, 0.3, 0.6)
+_MAX_STEP = 0.45  # of levels, in wavelengths of path difference; larger ones send light into the mirror direction
+_MIN_PATH = 0.75  # of the whole relief, in wavelengths
+_MAX_LIT = 0.6  # fraction of the frame that is light
+
+
+@dataclass(frozen=True)
+class Verdict:
+    """What a plate is worth: "good", "visible" or "bad", with its measures and, unless it is good, a remedy.
+
+    Attributes:
+        grade: by `GOOD` and `VISIBLE`.
+        light, contrast, correlation: means over the wavelengths.
+        remedy: which option to change, or "".
+    """
+
+    grade: str
+    light: float
+    contrast: float
+    correlation: float
+    remedy: str
+
+    @classmethod
+    def of(cls, design: Design) -> Verdict:
+        """Judge a design."""
+        measures = design.light, design.contrast, float(np.mean(design.correlation))
+        grade = next(
+            (
+                name
+                for name, bounds in (("good", GOOD), ("visible", VISIBLE))
+                if all(value >= bound for value, bound in zip(measures, bounds, strict=True))
+            ),
+            "bad",
+        )
+        return cls(grade, *measures, "" if grade == "good" else _remedy(design))
+
+    def __str__(self) -> str:
+        numbers = (
+            f"{self.light:.0%} of the light in the picture, contrast {self.contrast:.2f}, correlation "
+            f"{self.correlation:.2f}"
+        )
+        if self.grade == "good":
+            return f"good: {numbers}"
+        said = "the picture can be seen, but is pale or uneven" if self.grade == "visible" else "the picture fails"
+        return f"{said}: {numbers}; {self.remedy}"
+
+
+def _remedy(design: Design) -> str:
+    """Return the option that most likely helps, the first cause that is found."""
+    plate = design.plate
+    wave = _depth(plate)  # µm, of a path difference of one wavelength
+    path = plate.height_range / wave
+    if path < _MIN_PATH:
+        return f"the relief is too shallow: raise --height-range to {3 * wave:.2g} µm, or at least {wave:.2g}"
+    if plate.levels == 2:
+        return (
+            "two levels send as much light into the picture turned by half a circle: raise --levels to 4 or more, with "
+            f"--height-range {wave * 3 / 4:.2g}"
+        )
+    if plate.levels is not None and path / (plate.levels - 1) > _MAX_STEP:
+        count = 1 + math.ceil(path / _MAX_STEP)
+        return (
+            f"the steps are too high: raise --levels to {count} or more, or lower --height-range to "
+            f"{wave * (plate.levels - 1) / plate.levels:.2g} µm"
+        )
+    if plate.tool_blur > plate.texel:
+        return f"the tool is too blunt: --tool-blur of at most a texel, {plate.texel:.2g} µm"
+    if design.inside.mean() > _MAX_LIT:
+        return "most of the picture is light: --invert casts its dark parts instead"
+    return "use a picture of less detail, or more --texels"
+
+
+def _depth(plate: Plate) -> float:
+    """Return the depth in µm that is a path difference of one wavelength, the mean of those of the design."""
+    return float(2 * np.pi / np.abs(plate.kappa).mean())
