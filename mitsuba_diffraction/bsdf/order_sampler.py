@@ -98,7 +98,7 @@ class OrderSampler:
         low, high = borders.min(1), borders.max(1)
         sums, bins, fractions, start = [], [], [], 0
         for scales, above in itertools.product(ranges, sides):
-            furnaces = [Furnace.of(spectrum, scale, stack, 1 if above else -1) for scale in scales]
+            furnaces = [Furnace.of(spectrum, scale, stack, 1 if above else -1, laterals[0]) for scale in scales]
             powers_of_sides = []
             for reflects in sides:
                 index = self._indices(above)[0] if reflects else abs(self.eta - 1)

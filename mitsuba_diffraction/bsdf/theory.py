@@ -220,7 +220,7 @@ class ScalarTheory(Theory):
         self.scattering = scattering
         if eta is None:
             return _of_coat(coat)
-        kappas = tuple(opaque(kappa) for kappa in small_kappas(self.spectrum, eta))
+        kappas = tuple(opaque(kappa) for kappa in small_kappas(self.spectrum, eta, self.scales.laterals[0]))
         sampler = scattering.sampler
         fraction = sampler.transmitted_fraction if isinstance(sampler, OrderSampler) else None
         dispersions = None, self.material.dispersion

@@ -303,7 +303,7 @@ class Furnace:
     @property
     def _min_kappa(self) -> float:
         nominal = 1.0 if self.stack is None else self.stack.nominal**self.side
-        return min_kappa(self.spectrum, nominal, self.height_scale)
+        return min_kappa(self.spectrum, nominal, self.height_scale, self.lobe_scale)
 
     def _power(self, component: Indices, kappa: Real, branch: int) -> Real:
         """Return the powers of components at κ; for transmitted light below κ₁ as `small_kappa`."""
@@ -323,20 +323,21 @@ class Furnace:
         return small_kappa(kappa, first, at(kappa), at(first), at(2 * first)) * is_forward
 
 
-def min_kappa(spectrum: PowerSpectrum, index: float, height_scale: float = 1.0) -> float:
-    """Return κ₁ in rad/µm, below which c_m/κ² of transmitted light is extrapolated linearly."""
-    first, undiffracted = small_kappas(spectrum, index)
+def min_kappa(spectrum: PowerSpectrum, index: float, height_scale: float = 1.0, lateral_scale: float = 1.0) -> float:
+    """Return κ₁ in rad/µm, below which c_m/κ² of transmitted light is extrapolated linearly; scales h/s and s."""
+    first, undiffracted = small_kappas(spectrum, index, lateral_scale)
     return min(first, undiffracted * height_scale)
 
 
-def small_kappas(spectrum: PowerSpectrum, index: float) -> tuple[float, float]:
+def small_kappas(spectrum: PowerSpectrum, index: float, lateral_scale: float = 1.0) -> tuple[float, float]:
     """Return the two bounds whose minimum is κ₁, in rad/µm.
 
     The first is a quarter of the first interval of the table, where its error is as small as that of the linear
-    extrapolation. The second, to be multiplied by the scale of the heights, is 0.8 of the minimum κ of undiffracted
-    light at normal incidence. Wavelengths of the spectrum are those in the denser medium.
+    extrapolation. The second, to be multiplied by the ratio h/s of the scales of heights and lengths, is 0.8 of the
+    minimum κ of undiffracted light at normal incidence; the longest wavelength is λ/s, with the minimum s. Wavelengths
+    of the spectrum are those in the denser medium.
     """
-    max_wavelength = spectrum.wavelengths[1] * 1e-3 * max(index, 1)
+    max_wavelength = spectrum.wavelengths[1] * 1e-3 * max(index, 1) / lateral_scale
     return spectrum.table.first_interval / 4, 1.6 * np.pi * abs(index - 1) / max_wavelength
 
 

@@ -4,6 +4,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 import pytest
+import scipy.special
 from bsdf_support import (
     PERIOD,
     SURFACES,
@@ -347,3 +348,21 @@ def test_a_relief_of_no_height_is_a_plane(llvm, surface, scale):
     # Uniform directions find what samples miss.
     above = random_directions(np.random.default_rng(1), 20_000)
     assert evaluate(bsdf, wi, above, uv=uv)[0].mean() * 2 * np.pi < 0.05
+
+
+@pytest.mark.parametrize("transmission", ["interface", "sheet"])
+def test_undiffracted_light_of_a_finer_grating_is_that_of_the_closed_form(llvm, transmission):
+    """(1 − F) J₀(π (n − 1) h/λ)², on a grid about order 0; at lateral scales below one it was extrapolated as κ²."""
+    surface = {"profile": "sinusoidal", "period": 5.0, "depth": 0.3, "int_ior": 1.5, "ext_ior": 1.0}
+    scales = {"height_scale": 0.1, "lateral_scale": 0.3, "conserve_energy": False}
+    bsdf = mi.load_dict({"type": "diffraction_grating", **surface, **scales, "transmission": transmission})
+    context = mi.BSDFContext()
+    context.mode = mi.TransportMode.Importance
+    for wavelength in (450.0, 650.0, 800.0):
+        step = wavelength * 1e-3 * bsdf.spectrum.lobe_width / (1.5 if transmission == "interface" else 1) / 5
+        t = np.stack(np.meshgrid(*[np.arange(-30, 31) * step] * 2), -1).reshape(-1, 2)
+        wo = np.column_stack([t, -np.sqrt(1 - (t**2).sum(-1))])
+        value, _ = testing.evaluate_pdf(bsdf, np.array([0, 0, 1.0]), wo, [wavelength] * 4, context)
+        power = (value[:, 0] / -wo[:, 2]).sum() * step**2
+        wanted = 0.96 * scipy.special.jv(0, np.pi * 0.5 * 0.03 / (wavelength * 1e-3)) ** 2
+        assert power == pytest.approx(wanted * (0.96 if transmission == "sheet" else 1), rel=0.01)
