@@ -6,14 +6,17 @@ variant; importing `mitsuba_diffraction` has the same effect in all versions.
 
 from __future__ import annotations
 
+import contextlib
 import functools
+import gc
 import importlib
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 
 import drjit as dr
 import mitsuba as mi
 
 from . import llvm
+from .bsdf.base import living
 from .bsdf.light import cover_light
 from .bsdf.parameters import hand_over
 from .errors import Bug, RequestError, root_cause
@@ -56,10 +59,7 @@ def _with_short_errors(load: Callable[..., mi.Object]) -> Callable[..., mi.Objec
     @functools.wraps(load)
     def loader(scene: dict | str, *args: object, **kwargs: object) -> mi.Object:
         try:
-            loaded = load(hand_over(scene), *args, **kwargs)
-            if isinstance(loaded, mi.Scene):
-                cover_light(loaded)
-            return loaded
+            return _with_light(load(hand_over(scene), *args, **kwargs))
         except RequestError as error:
             line = str(error)
         except RuntimeError as error:
@@ -74,8 +74,42 @@ def _with_short_errors(load: Callable[..., mi.Object]) -> Callable[..., mi.Objec
     return loader
 
 
+def _with_light(loaded: mi.Object) -> mi.Object:
+    """Return a scene whose gratings cover its light; if they cannot, only this frame has referred to it."""
+    if isinstance(loaded, mi.Scene):
+        cover_light(loaded)
+    return loaded
+
+
+_count = 0  # of gratings at the last picture
+
+
+@contextlib.contextmanager
+def _garbage_withheld() -> Iterator[None]:
+    """Collect garbage before a picture is traced, if there are more gratings than at the last one, but not inside.
+
+    Dr.Jit calls all gratings in the kernels of all scenes, and where Python frees a BSDF while Dr.Jit traces, the
+    process dies (Mitsuba 3.9.1, any BSDF). Python's collector, which runs because a grating is Python code, frees
+    scenes that stand in reference cycles of the user.
+    """
+    global _count
+    was_enabled = gc.isenabled()
+    if was_enabled and len(living) > _count:
+        gc.collect()
+    _count = len(living)
+    gc.disable()
+    try:
+        yield
+    finally:
+        if was_enabled:
+            gc.enable()
+
+
 def _with_light_covered(render: Callable[..., mi.TensorXf]) -> Callable[..., mi.TensorXf]:
-    """Return `mi.render`, for sensors that are not in the scene, and lights that changed since it was loaded."""
+    """Return `mi.render`, for sensors that are not in the scene, and lights that changed since it was loaded.
+
+    Garbage is not collected while it traces.
+    """
 
     @functools.wraps(render)
     def renderer(
@@ -83,7 +117,8 @@ def _with_light_covered(render: Callable[..., mi.TensorXf]) -> Callable[..., mi.
     ) -> mi.TensorXf:
         if isinstance(scene, mi.Scene):
             cover_light(scene, sensor)
-        return render(scene, params, sensor, *args, **kwargs)
+        with _garbage_withheld():
+            return render(scene, params, sensor, *args, **kwargs)
 
     return renderer
 

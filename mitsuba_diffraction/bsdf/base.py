@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import functools
 import re
+import weakref
 from typing import Any
 
 import drjit as dr
@@ -10,6 +12,8 @@ import mitsuba as mi
 import numpy as np
 
 from ..errors import RequestError, is_number
+
+living: weakref.WeakSet[mi.BSDF] = weakref.WeakSet()  # the gratings of all scenes
 
 
 def nested_plugin(kind: str, **parameters: object) -> mi.Object:
@@ -38,15 +42,25 @@ def gratings_in(bsdf: mi.BSDF | None) -> list[mi.BSDF]:
 
 def parts(plugin: mi.Object, kind: type) -> list[Any]:
     """Return the objects of a class that a plugin holds as parameters, such as both BSDFs of a `twosided`."""
-    found = []
+    callback = _collector()(kind)
+    plugin.traverse(callback)
+    return callback.found
 
-    class Callback(mi.TraversalCallback):
+
+@functools.cache
+def _collector() -> type:
+    """Define the callback of `parts`, once: a class is a reference cycle, and keeps alive what its methods hold."""
+
+    class Collector(mi.TraversalCallback):
+        def __init__(self, kind: type) -> None:
+            mi.TraversalCallback.__init__(self)
+            self.kind, self.found = kind, list[Any]()
+
         def put(self, name: str, value: object, *rest: object) -> None:
-            if isinstance(value, kind):
-                found.append(value)
+            if isinstance(value, self.kind):
+                self.found.append(value)
 
-    plugin.traverse(Callback())
-    return found
+    return Collector
 
 
 def base_from(props: mi.Properties) -> Base | None:

@@ -13,7 +13,7 @@ from ..manual import Parameter, listed
 from ..materials import DISPERSION
 from ..recipe import Recipe, parameters_of_profile
 from ..surface.gratings import PROFILES
-from .base import base_from
+from .base import base_from, living
 from .layers import Layers
 from .parameters import GratingRequest
 from .thin_film import MAX_THICKNESS
@@ -198,6 +198,7 @@ def define() -> type:
             self.layers = Layers(props)
             self.spectrum = self.layers.grating.spectrum
             mi.BSDF.__init__(self, props)
+            living.add(self)
             self.m_components = self.layers.components
             self.m_flags = functools.reduce(operator.or_, self.m_components)
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 import os
 import re
 import time
@@ -32,10 +33,18 @@ from ..realtime_shader.surfaces import gratings_of, sum_along
 from ..realtime_shader.tristimulus import EMISSION, primary_spectra
 
 
-def _integrator(radiance: Callable[..., tuple[mi.Spectrum, mi.Bool]]) -> mi.SamplingIntegrator:
-    """Return an integrator of radiance(scene, ray, active), which returns radiance and whether a surface was hit."""
+@functools.cache
+def _part_integrator(variant: str) -> type:
+    """Define an integrator of radiance(scene, ray, active), once for a variant, on which its base class depends.
+
+    It is not defined for each function: a class is a reference cycle, and keeps alive what its methods refer to.
+    """
 
     class PartIntegrator(mi.SamplingIntegrator):
+        def __init__(self, radiance: Callable[..., tuple[mi.Spectrum, mi.Bool]]) -> None:
+            mi.SamplingIntegrator.__init__(self, mi.Properties("part"))
+            self.radiance = radiance
+
         def sample(
             self,
             scene: mi.Scene,
@@ -44,9 +53,14 @@ def _integrator(radiance: Callable[..., tuple[mi.Spectrum, mi.Bool]]) -> mi.Samp
             medium: mi.Medium | None = None,
             active: mi.Bool = True,
         ) -> tuple[mi.Spectrum, mi.Bool, list[mi.Float]]:
-            return *radiance(scene, ray, active), []
+            return *self.radiance(scene, ray, active), []
 
-    return PartIntegrator(mi.Properties("part"))
+    return PartIntegrator
+
+
+def _integrator(radiance: Callable[..., tuple[mi.Spectrum, mi.Bool]]) -> mi.SamplingIntegrator:
+    """Return an integrator of radiance(scene, ray, active), which returns radiance and whether a surface was hit."""
+    return _part_integrator(mi.variant())(radiance)
 
 
 def same_light(scene: mi.Scene) -> mi.SamplingIntegrator:
