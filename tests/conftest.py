@@ -33,6 +33,12 @@ _TAKES_LONG = {"mi", "Furnace", "NotebookClient", "subprocess"}
 """What test modules import whose tests compile kernels, trace light in a furnace or start Python anew."""
 
 
+def pytest_addoption(parser):
+    """Add the options of tests/soak."""
+    parser.addoption("--soak", type=float, default=0.0, metavar="MINUTES", help="try random configurations for so long")
+    parser.addoption("--soak-seed", type=int, metavar="SEED", help="of the first configurations; printed with a fault")
+
+
 def pytest_configure(config):
     """Draw fewer examples where slow tests are left out."""
     settings.load_profile("tests" if "not slow" in config.option.markexpr else "slow")

@@ -1,0 +1,358 @@
+"""Configurations of a grating, drawn at random and continuously from everything that a scene may request."""
+
+from __future__ import annotations
+
+import functools
+from dataclasses import dataclass, replace
+
+import mitsuba as mi
+import numpy as np
+from hypothesis import strategies as st
+
+import mitsuba_diffraction as md
+
+METALS = ("Al", "Au", "Ag", "Cu", "Cr")
+VISIBLE = (360.0, 830.0)
+
+
+@dataclass(frozen=True)
+class Surface:
+    """A relief of one period, or a piece of a random one.
+
+    `shape` is the apex of a triangle (1: a sawtooth) or the width of a ridge, as fractions of the period; random
+    surfaces are drawn from `seed`. A crossed one is the sum of both profiles, along x and y.
+    """
+
+    kind: str = "sinusoid"
+    period: tuple[float, float] = (2.5, 2.5)
+    depth: float = 0.3
+    shape: float = 1.0
+    seed: int = 0
+    turned: bool = False
+    count: int = 1
+    by_name: bool = False
+
+    @property
+    def is_line(self):
+        return self.kind in ("flat", "sinusoid", "triangle", "ridges", "harmonics")
+
+    @property
+    def samples(self):
+        # Frequencies of all light that propagates inside of the densest medium, at lengths scaled by one.
+        return 512 if self.is_line else 96
+
+    @property
+    def tile(self):
+        n = self.samples
+        if self.is_line:
+            return (self.period[0] / n, self.period[0]) if self.turned else (self.period[0], self.period[0] / n)
+        return self.period
+
+    def _profile(self, kind, seed):
+        x = np.arange(self.samples) / self.samples
+        if kind == "flat":
+            return 0 * x
+        if kind == "sinusoid":
+            return self.depth * 0.5 * (1 + np.sin(2 * np.pi * x))
+        if kind == "triangle":
+            rise = x / self.shape
+            return self.depth * np.where(x < self.shape, rise, (1 - x) / max(1 - self.shape, 1e-9))
+        if kind == "ridges":
+            return self.depth * (x < self.shape)
+        rng = np.random.default_rng(seed)
+        k = np.arange(1, 7)
+        a, phase = rng.normal(size=6) / k, rng.uniform(0, 2 * np.pi, 6)
+        h = (a * np.cos(2 * np.pi * np.outer(x, k) + phase)).sum(-1)
+        return self.depth * (h - h.min()) / np.ptp(h)
+
+    def _random(self, seed):
+        rng, n = np.random.default_rng(seed), self.samples
+        fx, fy = np.meshgrid(*(np.fft.fftfreq(n, period / n) for period in self.period))
+        spectrum = np.exp(-(fx**2 + fy**2) / (2 * (0.3 + self.shape) ** 2)) * np.exp(2j * np.pi * rng.random((n, n)))
+        h = np.fft.ifft2(spectrum).real
+        return self.depth * (h - h.min()) / np.ptp(h)
+
+    @functools.lru_cache(maxsize=64)  # noqa: B019
+    def patches(self):
+        """Heights (rows, columns) of each patch, µm."""
+        if self.is_line:
+            found = [self._profile(self.kind, self.seed + k)[None] for k in range(self.count)]
+            return [h.T for h in found] if self.turned else found
+        if self.kind == "crossed":
+            x, y = self._profile("sinusoid", 0), self._profile("triangle", 0)
+            return [x[None] + y[:, None]]
+        return [self._random(self.seed + k) for k in range(self.count)]
+
+
+@dataclass(frozen=True)
+class At:
+    """The parameters at one point of the surface."""
+
+    orientation: float = 0.0
+    height_scale: float = 1.0
+    lateral_scale: float = 1.0
+
+
+@dataclass(frozen=True)
+class Configuration:
+    """A grating, and the light with which it is tried.
+
+    Attributes:
+        orientation, height_scale, lateral_scale: numbers, or the values of four texels.
+        directions: (θ, φ, texel): degrees from the normal and from x, and which texel is hit.
+        wavelengths: those of a ray, nm.
+    """
+
+    surface: Surface = Surface()
+    coherence_length: float = 65.0
+    extent: str = "tile"
+    representation: str = "auto"
+    material: object = "none"
+    outside: float = 1.0
+    coat: float | None = None
+    film: tuple | None = None
+    transmission: str = "none"
+    base: float | None = None
+    orientation: float | tuple = 0.0
+    height_scale: float | tuple = 1.0
+    lateral_scale: float | tuple = 1.0
+    shadowing: str = "v_cavity"
+    conserve_energy: bool = True
+    polarised: bool = False
+    directions: tuple = ((45.0, 0.0, 0),)
+    wavelengths: tuple = (450.0, 500.0, 550.0, 620.0)
+
+    def at(self, texel):
+        return At(*(_texel(getattr(self, name), texel) for name in ("orientation", "height_scale", "lateral_scale")))
+
+    @property
+    def densest(self):
+        return max(self.outside, self.coat or 1.0, self.material if self.transmission != "none" else 1.0)
+
+    @property
+    def max_lateral(self):
+        return float(np.max(self.lateral_scale))
+
+    @property
+    def is_resolved(self):
+        """Whether orders certainly do not overlap, not even the squares about them."""
+        return self.extent == "tile" and self.coherence_length >= 8 * self.max_lateral * max(self.surface.period)
+
+    @property
+    def is_discrete(self):
+        """Whether the plugin evaluates orders one by one."""
+        return self.extent == "tile" and (self.surface.is_line or self.is_resolved)
+
+    @property
+    def conserves_energy(self):
+        return self.conserve_energy and self.shadowing == "v_cavity"
+
+    def spectrum(self):
+        """The spectrum of the surface, for all light next to the relief."""
+        scale = max(1.0, float(np.max(self.height_scale)), self.max_lateral)
+        return _spectrum(
+            self.surface,
+            self.coherence_length,
+            self.extent,
+            self.representation,
+            (float(np.floor(0.95 * VISIBLE[0] / (self.densest * scale))), VISIBLE[1]),
+        )
+
+    def dictionary(self, **others):
+        """The scene dictionary; `others` replace its entries, and leave out those that are None."""
+        result = {"type": "diffraction_grating"}
+        if self.surface.by_name:
+            name = {"sinusoid": "sinusoidal", "triangle": "blazed"}[self.surface.kind]
+            result |= {"profile": name, "period": self.surface.period[0], "depth": self.surface.depth}
+            result |= {"coherence_length": self.coherence_length}
+        else:
+            result["spectrum"] = self.spectrum()
+        if isinstance(self.material, str):
+            result["material"] = self.material
+        else:
+            result["int_ior"] = self.material
+        if self.outside != 1 or not isinstance(self.material, str):
+            result["ext_ior"] = self.outside
+        if self.coat is not None:
+            result["coat_ior"] = self.coat
+            result.setdefault("ext_ior", self.outside)
+        if self.film is not None:
+            result |= {"thin_film_ior": self.film[0], "thin_film_thickness": self.film[1]}
+        if self.transmission != "none":
+            result["transmission"] = self.transmission
+        if self.base is not None:
+            result["base"] = {"type": "diffuse", "reflectance": {"type": "uniform", "value": self.base}}
+        for name, default in (("orientation", 0.0), ("height_scale", 1.0), ("lateral_scale", 1.0)):
+            value = getattr(self, name)
+            if isinstance(value, tuple):
+                result[name] = texture(value)
+            elif value != default:
+                result[name] = value
+        if self.shadowing != "v_cavity":
+            result["shadowing"] = self.shadowing
+        if not self.conserve_energy:
+            result["conserve_energy"] = False
+        result |= others
+        return {name: value for name, value in result.items() if value is not None}
+
+
+def _texel(value, texel):
+    return value[texel] if isinstance(value, tuple) else value
+
+
+def texture(values):
+    """Four texels in a row, as they are."""
+    bitmap = mi.Bitmap(np.float32(values).reshape(1, 4, 1))
+    return {"type": "bitmap", "bitmap": bitmap, "raw": True, "format": "variant", "filter_type": "nearest"}
+
+
+def uv(texel):
+    return (0.125 + 0.25 * texel, 0.5)
+
+
+@functools.lru_cache(maxsize=256)
+def _spectrum(surface, coherence_length, extent, representation, wavelengths):
+    pixel = tuple(t / n for t, n in zip(surface.tile, surface.patches()[0].shape[::-1], strict=True))
+    patches = [md.HeightField(h, pixel) for h in surface.patches()]
+    return md.precompute(
+        patches if len(patches) > 1 else patches[0],
+        coherence_length=coherence_length,
+        extent=extent,
+        representation=representation,
+        wavelengths=wavelengths,
+        tolerance=1e-3 if surface.is_line or extent == "tile" else 1e-2,
+    )
+
+
+def _rounded(low, high, digits=3):
+    return st.floats(low, high).map(lambda x: round(x, digits))
+
+
+def _geometric(low, high):
+    return st.floats(np.log(low), np.log(high)).map(lambda x: round(float(np.exp(x)), 3))
+
+
+def _numbers(low, high, neutral, allowed=True):
+    """A number, most often the neutral one, or four texels."""
+    number = _rounded(low, high)
+    if not allowed:
+        return st.just(neutral)
+    return st.one_of(st.just(neutral), number, st.tuples(number, number, number, number))
+
+
+@st.composite
+def surfaces(draw, sample=False):
+    if sample:
+        return Surface(
+            "random",
+            (round(draw(_rounded(8, 12)), 2),) * 2,
+            draw(_rounded(0.02, 0.6)),
+            draw(_rounded(0.1, 1)),
+            draw(st.integers(0, 99)),
+        )
+    kind = draw(st.sampled_from(["sinusoid", "triangle", "ridges", "harmonics", "crossed", "random", "flat"]))
+    is_line = kind not in ("crossed", "random")
+    period = draw(_geometric(0.4, 12.0 if is_line else 4.0))
+    other = period if is_line else draw(st.one_of(st.just(period), _geometric(0.6, 4.0)))
+    shape = draw(st.one_of(st.just(1.0 if kind == "triangle" else 0.5), _rounded(0.05, 0.95)))
+    count = draw(st.integers(1, 3)) if kind in ("harmonics", "random") else 1
+    can_name = kind == "sinusoid" or (kind == "triangle" and shape == 1)
+    return Surface(
+        kind,
+        (period, other),
+        draw(_rounded(0.01, 1.2)),
+        shape,
+        draw(st.integers(0, 99)),
+        turned=is_line and draw(st.booleans()),
+        count=count,
+        by_name=False and can_name,
+    )
+
+
+@st.composite
+def configurations(draw):
+    """Draw a configuration that the plugin accepts."""
+    sample = draw(st.sampled_from([False] * 9 + [True]))
+    surface = draw(surfaces(sample))
+    transmission = draw(st.sampled_from(["none", "none", "interface", "sheet"]))
+    index = _rounded(1.05, 4.0)
+    if transmission != "none":
+        outside = draw(st.one_of(st.just(1.0), _rounded(1.0, 1.6)))
+        material = draw(st.one_of(st.just(1.5), index).filter(lambda n: abs(n - outside) > 0.03))
+        coat = base = None
+    else:
+        material = draw(st.one_of(st.just("none"), st.sampled_from(METALS), index))
+        coat = draw(st.one_of(st.none(), st.just(1.5), _rounded(1.05, 2.4)))
+        outside = 1.0
+        if coat is not None or not isinstance(material, str):
+            outside = draw(st.one_of(st.just(1.0), _rounded(1.0, 1.4)))
+            outside = min(outside, coat - 0.04) if coat else outside
+        base = draw(st.one_of(st.none(), _rounded(0.0, 1.0))) if not isinstance(material, str) else None
+    film = None
+    if material != "none":
+        film = draw(
+            st.one_of(
+                st.none(),
+                st.tuples(
+                    st.one_of(_rounded(1.05, 4.0), st.sampled_from(METALS)),
+                    st.one_of(_rounded(0.0, 0.3), _rounded(0.0, 2.0)),
+                ),
+            )
+        )
+    densest = max(outside, coat or 1.0, material if transmission != "none" else 1.0)
+    lateral = draw(_numbers(0.4, 1.0, 1.0, not sample and draw(st.booleans())))
+    longest = max(surface.period) * float(np.max(lateral))
+    if sample:
+        coherence = draw(_rounded(2.0, 4.0))
+    elif lateral != 1:
+        coherence = round(max(draw(_rounded(8.5, 30)) * longest, 16.0), 2)
+    else:
+        coherence = draw(
+            st.one_of(
+                st.just(65.0) if longest < 8 else st.nothing(),
+                _rounded(8.5, 30).map(lambda x: round(x * longest, 2)),
+                _rounded(0.7, 6).map(lambda x: round(max(x * longest, 1.5), 2)),
+            )
+        )
+    # E of two-dimensional reliefs takes long, above all where scales vary.
+    energy = draw(st.booleans() if surface.is_line else st.sampled_from([False, False, False, True]))
+    if not surface.is_line and energy:
+        lateral = 1.0
+    single = surface.count == 1 and not sample and surface.kind != "flat"
+    representation = "auto"
+    if single and surface.depth * densest < 0.8:
+        representation = draw(st.sampled_from(["auto", "auto", "chebyshev", "taylor"]))
+        if representation == "taylor" and surface.depth * densest * float(np.max(lateral)) > 0.4:
+            representation = "auto"
+    grazing, inclined = _rounded(85, 89.9, 2), _rounded(0, 85, 2)
+    above = st.one_of(inclined, inclined, grazing)
+    theta = above if transmission == "none" else st.one_of(above, above.map(lambda angle: 180 - angle))
+    directions = st.lists(
+        st.tuples(theta, st.one_of(st.just(0.0), _rounded(0, 360, 1)), st.integers(0, 3)), min_size=1, max_size=3
+    )
+    wavelengths = draw(st.lists(_rounded(*VISIBLE, 1), min_size=4, max_size=4))
+    return Configuration(
+        surface=surface,
+        coherence_length=coherence,
+        extent="sample" if sample else "tile",
+        representation=representation,
+        material=material,
+        outside=outside,
+        coat=coat,
+        film=film,
+        transmission=transmission,
+        base=base,
+        orientation=draw(_numbers(-360, 720, 0.0)),
+        height_scale=draw(_numbers(0.05, 1.0, 1.0, surface.is_line or not energy)),
+        lateral_scale=lateral,
+        shadowing=draw(st.sampled_from(["v_cavity", "v_cavity", "v_cavity", "none"])),
+        conserve_energy=energy,
+        polarised=draw(st.sampled_from([False] * 7 + [True])),
+        directions=tuple(draw(directions)),
+        wavelengths=tuple(wavelengths),
+    )
+
+
+def neutral(configuration):
+    """The same without what varies or multiplies, for the oracles that compare with a simpler scene."""
+    return replace(configuration, height_scale=1.0, lateral_scale=1.0)

@@ -1,0 +1,546 @@
+"""What must hold for every configuration. Nothing here is computed by what it judges."""
+
+from __future__ import annotations
+
+import functools
+from dataclasses import replace
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+from soak_grammar import Configuration, texture, uv
+from soak_model import Model, plane
+
+from mitsuba_diffraction import testing
+
+SAMPLES = 1 << 16
+SIGMAS = 6.0  # half the side of the square about an order, in standard deviations of its lobe
+DEVIATIONS = 6.0  # of an estimate, up to which it is accepted
+QUADRATURE = 0.02  # relative error of the integrals on a grid
+MAX_POINTS = 1_500_000  # of the grids of a configuration
+VARIANTS = {False: "llvm_ad_spectral", True: "llvm_ad_spectral_polarized"}
+
+
+class Fault(AssertionError):
+    """An oracle was contradicted."""
+
+
+@functools.cache
+def fault_of(oracle):
+    """An exception of its own, so that a fault does not shrink to another one."""
+    return type("Fault", (Fault,), {"__doc__": oracle})
+
+
+def require(condition, oracle, configuration, **numbers):
+    if not condition:
+        shown = "".join(f"\n  {name} = {value}" for name, value in numbers.items())
+        raise fault_of(oracle)(f"{oracle}{shown}\n{configuration}")
+
+
+def direction(theta, phi):
+    theta, phi = np.deg2rad(theta), np.deg2rad(phi)
+    return np.array([np.sin(theta) * np.cos(phi), np.sin(theta) * np.sin(phi), np.cos(theta)])
+
+
+class Case:
+    """A configuration, its BSDF and its model."""
+
+    def __init__(self, configuration: Configuration):
+        mi.set_variant(VARIANTS[configuration.polarised])
+        self.c, self.wavelengths = configuration, np.array(configuration.wavelengths)
+        self.bsdf = mi.load_dict(configuration.dictionary())
+        self.model = Model(configuration)
+        # Directions as they are in float32, as cosines at 89.9° are rounded by 1e-4.
+        self.directions = [
+            (direction(theta, phi).astype(np.float32).astype(float), texel)
+            for theta, phi, texel in configuration.directions
+        ]
+        self.importance = mi.BSDFContext(mi.TransportMode.Importance)
+
+    def require(self, condition, oracle, **numbers):
+        require(condition, oracle, self.c, **numbers)
+
+    def evaluate(self, wi, wo, texel, context=None, bsdf=None):
+        return testing.evaluate_pdf(bsdf or self.bsdf, wi, wo, self.wavelengths, context, uv(texel))
+
+    def power(self, wi, wo, radiance):
+        """The sum of power; refracted radiance grows with n²."""
+        (n_i,), n_o = (self.model.indices(z > 0)[0] for z in (wi[2:], wo[:, 2]))
+        return (radiance * (n_o / n_i) ** 2).sum()
+
+    @property
+    def sides(self):
+        return (False, True) if self.c.transmission != "none" else (False,)
+
+    @functools.cached_property
+    def samples(self):
+        """Per direction: ω_o, weights, pdf, whether they are specular."""
+        found = []
+        for seed, (wi, texel) in enumerate(self.directions):
+            wo, weight, bs = testing.sample(
+                self.bsdf, np.tile(wi, (SAMPLES, 1)), self.wavelengths, seed + 1, None, uv(texel)
+            )
+            pdf = np.array(bs.pdf, float) + np.zeros(SAMPLES)
+            is_delta = np.array(mi.has_flag(bs.sampled_type, mi.BSDFFlags.Delta)) & np.ones(SAMPLES, bool)
+            found.append((wo, weight, pdf, is_delta))
+        return found
+
+    @functools.cached_property
+    def centres(self):
+        """Per direction, wavelength and side: orders and their ω_o."""
+        return {
+            (k, channel, below): self.model.orders(wi, wavelength * 1e-3, below, self.c.at(texel))
+            for k, (wi, texel) in enumerate(self.directions)
+            for channel, wavelength in enumerate(self.wavelengths)
+            for below in self.sides
+        }
+
+
+# (a) -----------------------------------------------------------------------------------------------------------------
+def value_is_that_of_the_model(case: Case):
+    """f at the centres of orders is that of the model, but for E, which is at most one, and one where nothing is gained."""
+    c, model = case.c, case.model
+    if not c.is_discrete or (c.polarised and (c.coat or c.transmission == "sheet" or c.film or c.base is not None)):
+        return
+    tolerance = 1e-3
+    for (k, channel, below), (m, wo) in case.centres.items():
+        wi, texel = case.directions[k]
+        if len(m) == 0:
+            continue
+        at, wavelength = c.at(texel), np.full(len(m), case.wavelengths[channel] * 1e-3)
+        incident = np.repeat(wi[None], len(m), axis=0)
+        wo = wo.astype(np.float32).astype(float)
+        expected, slack, kappa = np.zeros(len(m)), np.zeros(len(m)), None
+        # Neighbouring orders, where lobes overlap.
+        reach = [
+            0 if n == 1 else int(min(np.ceil(5 * model.sigma_q * t * at.lateral_scale), 3))
+            for n, t in zip(model.patches[0].shape[::-1], model.tile, strict=True)
+        ]
+        for x in range(-reach[0], reach[0] + 1):
+            for y in range(-reach[1], reach[1] + 1):
+                common, eta, lobe, found = model.terms(incident, wo, m + [x, y], wavelength, at)
+                expected, slack = expected + common * eta * lobe, slack + common * lobe
+                kappa = found if (x, y) == (0, 0) else kappa
+        faces = model.face(incident) * model.face(wo)
+        base = model.of_base(incident, wo, wavelength)
+        cos = np.abs(wo[:, 2])
+        got = case.evaluate(incident, wo, texel, case.importance)[0][:, channel] / cos
+        base = base * faces * (wo[:, 2] > 0)
+        expected, slack = expected * faces, slack * faces
+        # Where κ is small, K diverges, and the table is extrapolated.
+        crosses = (wo[:, 2] > 0) != (wi[2] > 0)
+        small = 2 * np.pi * abs(_below(c) - c.outside) / wavelength * at.height_scale
+        relative = np.where(crosses & (kappa < small), 0.03, 0.004)
+        # float32 of q in a narrow lobe, and of cosines next to the horizon
+        relative = relative + 3e-6 / (wavelength * model.sigma_q) + 2e-6 / cos**2 + 2e-6 / wi[2] ** 2
+        enlarged = np.where(crosses, np.maximum(kappa, 1e-9), 1)
+        enlarged = np.where(crosses, np.maximum(1, 0.25 * small / enlarged) ** 2, 1)
+        error = relative * (expected + base) + tolerance * slack / enlarged + 1e-6
+        worst = np.argmax((got - expected - base) / error)
+        note = dict(wi=wi, wavelength=wavelength[0], below=below)
+        case.require(
+            (got <= expected + base + error).all(),
+            "(a) f above that of the model",
+            **note,
+            m=m[worst],
+            wo=wo[worst],
+            got=got[worst],
+            expected=expected[worst],
+            base=base[worst],
+        )
+        at_least = expected
+        if c.conserves_energy:
+            at_least = np.zeros(len(m))
+            if c.surface.is_line and gains_nothing(case, wi, wavelength[0], at):
+                strong = np.flatnonzero(expected > 1e-3 * expected.max())[:12]
+                for j in strong:
+                    if gains_nothing(case, wo[j], wavelength[0], at):
+                        at_least[j] = 0.97 * expected[j]
+        worst = np.argmin((got - at_least - base) / error)
+        case.require(
+            (got >= at_least + base - error).all(),
+            "(a) f below that of the model",
+            **note,
+            m=m[worst],
+            wo=wo[worst],
+            got=got[worst],
+            expected=expected[worst],
+            base=base[worst],
+        )
+
+
+def _below(c):
+    return c.material if c.transmission != "none" else c.outside
+
+
+def gains_nothing(case, omega, wavelength, at):
+    """Whether the light from a direction and its neighbours certainly is no more than incident, so that E is one."""
+    c = case.c
+    model = Model(replace(c, material="none", film=None)) if c.transmission == "none" else case.model
+    theta, phi = np.arccos(np.clip(omega[2], -1, 1)), np.arctan2(omega[1], omega[0])
+    totals = []
+    for step in (0, -0.03, 0.03):
+        for factor in (1, 0.97, 1.03):
+            other = np.clip(abs(theta - np.pi / 2) + step, 0.005, np.pi / 2)
+            z = np.sin(other) * np.sign(omega[2])
+            r = np.cos(other)
+            totals.append(sum(model.albedo(np.array([r * np.cos(phi), r * np.sin(phi), z]), wavelength * factor, at)))
+    return max(totals) < 0.97
+
+
+# (b), (c), (e) --------------------------------------------------------------------------------------------------------
+def square_about(centre, sigma, fine):
+    """A set about an order: a test of membership, directions on a grid, and the dω of each."""
+    below, (x, y) = centre[2] < 0, centre[:2]
+    r = np.hypot(x, y)
+    side = 81 if fine else 41
+    # Jittered where the horizon of ω_i cuts through the lobe, as the cut may run along the grid.
+    rng = np.random.default_rng(11)
+
+    def steps(*shape):
+        return (np.arange(shape[-1]) + (rng.random(shape) if fine else np.full(shape, 0.5))) / shape[-1]
+
+    if r + 1.5 * SIGMAS * sigma < 1:
+        u, v = steps(side, side), steps(side, side).T
+        u, v = (c + SIGMAS * sigma * (2 * np.broadcast_to(s, (side, side)).ravel() - 1) for c, s in ((x, u), (y, v)))
+        z = np.sqrt(1 - u**2 - v**2)
+        area = (2 * SIGMAS * sigma / side) ** 2 / z
+
+        def contains(wo):
+            near = (np.abs(wo[:, 0] - x) < SIGMAS * sigma) & (np.abs(wo[:, 1] - y) < SIGMAS * sigma)
+            return near & ((wo[:, 2] < 0) == below)
+
+    else:
+        # Next to the horizon in polar coordinates, whose border is the horizon: dω = d(cos θ) dφ.
+        inner, outer = max(r - SIGMAS * sigma, 0.0), min(r + SIGMAS * sigma, 1.0)
+        low, high = np.sqrt(1 - outer**2), np.sqrt(1 - inner**2)
+        half = min(np.pi, SIGMAS * sigma / max(inner, 1e-3))
+        phi = np.arctan2(y, x)
+        wide = max(side, int(side * half * max(inner, 0.1) / (SIGMAS * sigma)))
+        z = (low + (high - low) * steps(wide, side)).ravel()
+        f = (phi + half * (2 * steps(side, wide).T - 1)).ravel()
+        rho = np.sqrt(1 - z**2)
+        u, v = rho * np.cos(f), rho * np.sin(f)
+        area = np.full(len(z), (high - low) / side * 2 * half / wide)
+
+        def contains(wo):
+            angle = np.angle(np.exp(1j * (np.arctan2(wo[:, 1], wo[:, 0]) - phi)))
+            height = np.abs(wo[:, 2])
+            return (np.abs(angle) < half) & (height > low) & (height <= high) & ((wo[:, 2] < 0) == below)
+
+    return contains, np.stack([u, v, -z if below else z], -1), area
+
+
+def samples_have_their_density_and_average_to_the_integral(case: Case):
+    """∫ pdf and ∫ eval over sets on a grid are the fraction of samples in it and their mean weight."""
+    for k in range(len(case.directions)):
+        wo, weight, pdf, is_delta = case.samples[k]
+        case.require(np.isfinite(weight).all() and (weight >= 0).all(), "(b) weights", k=k, worst=np.min(weight))
+        case.require(np.isfinite(pdf).all() and (pdf >= 0).all(), "(c) densities", k=k)
+        case.require(
+            (np.abs(np.linalg.norm(wo[pdf > 0], axis=-1) - 1) < 1e-4).all(), "(c) directions of unit length", k=k
+        )
+    (of_orders if case.c.is_resolved else of_sphere)(case)
+    for k in range(len(case.directions)):
+        mirror(case, k)
+
+
+def mirror(case: Case, k):
+    """The specular lobe of the face of a coat or sheet has the weight F."""
+    c, (wi, _) = case.c, case.directions[k]
+    wo, weight, pdf, is_delta = case.samples[k]
+    if c.coat:
+        expected = plane(abs(wi[2]), c.outside, c.coat, 0.0, c.coat, 1.0)[0]
+    elif c.transmission == "sheet" and wi[2] < 0:
+        expected = plane(abs(wi[2]), c.outside, c.material, 0.0, c.material, 1.0)[0]
+    else:
+        case.require(not is_delta.any(), "no mirror", k=k)
+        return
+    got = np.where(is_delta[:, None], weight, 0)
+    error = DEVIATIONS * got.std(0) / np.sqrt(SAMPLES) + 1e-3 * expected
+    # A mirror of little power is drawn rarely.
+    rare = 10 / SAMPLES if is_delta.sum() < 100 else 0
+    case.require(
+        (np.abs(got.mean(0) - expected) < error + rare).all(), "(b) mirror", wi=wi, got=got.mean(0), expected=expected
+    )
+
+
+def of_orders(case: Case):
+    c, model = case.c, case.model
+    total = np.zeros((len(case.directions), 4))
+    sets, points = [], 0
+    for (k, channel, below), (m, centres) in case.centres.items():
+        outer, _ = model.indices(np.array([not below]))
+        sigma = case.wavelengths[channel] * 1e-3 * model.sigma_q / outer[0]
+        wi, _ = case.directions[k]
+        for order, centre in zip(m, centres, strict=True):
+            fine = min(abs(wi[2]) ** 2, centre[2] ** 2) < 40 * sigma
+            sets.append((k, channel, order, *square_about(centre, sigma, fine)))
+            points += len(sets[-1][-1])
+    # With very many orders some of them, evenly spaced.
+    every = int(np.ceil(points / MAX_POINTS))
+    sets = sets[::every]
+    for k, (wi, texel) in enumerate(case.directions):
+        those = [s for s in sets if s[0] == k]
+        if not those:
+            continue
+        grid, area = np.concatenate([s[4] for s in those]), np.concatenate([s[5] for s in those])
+        value, density = case.evaluate(np.broadcast_to(wi, grid.shape), grid, texel)
+        _check_finite(case, value, density)
+        ends = np.cumsum([len(s[5]) for s in those])
+        for (_, channel, order, contains, _, _), start, end in zip(those, [0, *ends], ends, strict=False):
+            compare(
+                case,
+                k,
+                contains,
+                value[start:end] * area[start:end, None],
+                density[start:end, 0] * area[start:end],
+                area[start:end],
+                note=dict(order=order, wavelength=case.wavelengths[channel], centre=grid[start:end].mean(0)),
+            )
+            total[k, channel] += case.power(wi, grid[start:end], value[start:end, channel] * area[start:end])
+    if every == 1 and c.conserves_energy and c.base is None:
+        bound(case, total)
+
+
+def _check_finite(case, value, density):
+    case.require(np.isfinite(value).all() and np.isfinite(density).all(), "finite values and densities")
+    case.require((value >= 0).all() and (density >= 0).all(), "values and densities not negative")
+
+
+def compare(case, k, contains, value, density, area, note):
+    """Compare a set's ∫ eval and ∫ pdf with the samples that fall in it; `value` and `density` are times dω."""
+    wo, weight, pdf, is_delta = case.samples[k]
+    inside = contains(wo) & (pdf > 0) & ~is_delta
+    note = dict(wi=case.directions[k][0], **note)
+    p, fraction = density.sum(), inside.mean()
+    noise = DEVIATIONS * np.sqrt(max(p, fraction) / SAMPLES) + 20 / SAMPLES
+    case.require(
+        abs(p - fraction) < noise + QUADRATURE * max(p, fraction),
+        "(c) ∫ pdf = fraction drawn",
+        **note,
+        integral=p,
+        fraction=fraction,
+        noise=noise,
+    )
+    integral = value.sum(0)
+    found = np.where(inside[:, None], weight, 0)
+    # The variance from the grid as well, as few samples may have most of it.
+    with np.errstate(divide="ignore", invalid="ignore"):
+        square = np.where(density[:, None] > 0, value**2 / density[:, None], 0).sum(0)
+    variance = np.maximum(np.maximum(square - integral**2, 0), found.var(0))
+    noise = DEVIATIONS * np.sqrt(variance / SAMPLES) + 10 * found.max(0) / SAMPLES
+    ratio = np.where(density[:, None] > 0, value / np.maximum(density[:, None], 1e-30), 0)
+    noise += 20 * ratio.max(0) / SAMPLES
+    bad = np.abs(found.mean(0) - integral) > noise + QUADRATURE * integral + 1e-7
+    case.require(not bad.any(), "(b) ∫ eval = mean weight", **note, integral=integral, mean=found.mean(0), noise=noise)
+    undrawable = (density <= 0) & (value.sum(-1) > 0)
+    case.require(value[undrawable].sum(0).max(initial=0) < 1e-4, "(c) light that is never drawn", **note, lost=integral)
+
+
+def of_sphere(case: Case):
+    """As `of_orders`, over bins of the sphere with grids that are denser towards the horizon."""
+    c = case.c
+    rng = np.random.default_rng(5)
+    edges = np.array([0, 0.03, 0.08, 0.17, 0.3, 0.45, 0.6, 0.75, 0.9, 0.97, 1.0])
+    sigma = np.min(case.wavelengths) * 1e-3 * case.model.sigma_q / c.densest
+    per_sector = int(np.clip(np.ceil(2 * np.pi / 16 / (0.5 * sigma)), 12, 96))
+    per_ring = int(np.clip(np.ceil(0.15 / (0.5 * sigma)), 10, 64))
+    total = np.zeros((len(case.directions), 4))
+    for k, (wi, texel) in enumerate(case.directions):
+        for below in case.sides:
+            z, step = [], []
+            for low, high in zip(edges, edges[1:], strict=False):
+                z.append(np.linspace(low, high, per_ring + 1)[:-1])
+                step.append(np.full(per_ring, (high - low) / per_ring))
+            z, step = np.concatenate(z), np.concatenate(step)
+            count = 16 * per_sector
+            phi = np.arange(count) * 2 * np.pi / count
+            # Jittered, so that steps of the density do not beat with the grid.
+            z = z[:, None] + step[:, None] * rng.random((len(z), count))
+            phi = phi + 2 * np.pi / count * rng.random(z.shape)
+            rho = np.sqrt(1 - np.minimum(z, 1) ** 2)
+            grid = np.stack([rho * np.cos(phi), rho * np.sin(phi), -z if below else z], -1).reshape(-1, 3)
+            area = np.repeat(step * 2 * np.pi / count, count)
+            value, density = case.evaluate(np.broadcast_to(wi, grid.shape), grid, texel)
+            _check_finite(case, value, density)
+            total[k] += [case.power(wi, grid, of_channel * area) for of_channel in value.T]
+            ring = np.clip(np.searchsorted(edges, np.abs(grid[:, 2]), side="right") - 1, 0, len(edges) - 2)
+            sector = (np.arctan2(grid[:, 1], grid[:, 0]) % (2 * np.pi) / (2 * np.pi) * 16).astype(int) % 16
+            for r in range(len(edges) - 1):
+                for s in range(16):
+                    of_bin = (ring == r) & (sector == s)
+
+                    def contains(wo, r=r, s=s, below=below):
+                        height = np.abs(wo[:, 2])
+                        angle = (np.arctan2(wo[:, 1], wo[:, 0]) % (2 * np.pi) / (2 * np.pi) * 16).astype(int) % 16
+                        in_ring = (height >= edges[r]) & (height < edges[r + 1] + (r == len(edges) - 2))
+                        return in_ring & (angle == s) & ((wo[:, 2] < 0) == below)
+
+                    compare(
+                        case,
+                        k,
+                        contains,
+                        value[of_bin] * area[of_bin, None],
+                        density[of_bin, 0] * area[of_bin],
+                        area[of_bin],
+                        note=dict(ring=(edges[r], edges[r + 1]), sector=s, below=below),
+                    )
+    if c.conserves_energy and c.base is None:
+        bound(case, total)
+
+
+def bound(case: Case, total):
+    """(e) R + T ≤ bound; more is documented from inside of glass just below the critical angle."""
+    c = case.c
+    for (wi, _), of_direction in zip(case.directions, total, strict=True):
+        limit = 1.02 if wi[2] > 0 or c.transmission == "sheet" else 1.10
+        case.require((of_direction < limit + 0.015).all(), "(e) R + T ≤ bound", wi=wi, got=of_direction, limit=limit)
+
+
+# (d) -----------------------------------------------------------------------------------------------------------------
+def pairs(case: Case, count=200):
+    """Pairs of directions in lobes and outside of them."""
+    rng = np.random.default_rng(3)
+    for k, (wi, texel) in enumerate(case.directions):
+        found = [np.zeros((0, 3))]
+        if case.c.is_discrete:
+            found += [wo[:: max(1, len(wo) // 40)] for key, (_, wo) in case.centres.items() if key[0] == k]
+        other = rng.normal(size=(count, 3))
+        other /= np.linalg.norm(other, axis=-1, keepdims=True)
+        if case.c.transmission == "none":
+            other[:, 2] = np.abs(other[:, 2])
+        found = np.concatenate([*found, other])
+        sigma = 0.5 * case.model.sigma_q
+        found[:, :2] += sigma * rng.normal(size=(len(found), 2))
+        square = (found[:, :2] ** 2).sum(-1)
+        found = found[square < 0.9999]
+        found[:, 2] = np.sign(found[:, 2]) * np.sqrt(1 - square[square < 0.9999])
+        yield np.repeat(wi[None], len(found), axis=0), found, texel
+
+
+def is_reciprocal(case: Case):
+    model = case.model
+    for wi, wo, texel in pairs(case):
+        n_i, n_o = (model.indices(omega[:, 2] > 0)[0] for omega in (wi, wo))
+        there = case.evaluate(wi, wo, texel, case.importance)[0] / (np.abs(wo[:, 2]) * n_o**2)[:, None]
+        back = case.evaluate(wo, wi, texel, case.importance)[0] / (np.abs(wi[:, 2]) * n_i**2)[:, None]
+        radiance = case.evaluate(wi, wo, texel)[0] / (np.abs(wo[:, 2]) * n_i**2)[:, None]
+        # float32 of q at the edge of a narrow lobe, where it is cut off, and of cosines at the horizon
+        scale = np.maximum(there, back)
+        relative = 0.01 + 3e-5 / np.minimum(np.abs(wi[:, 2]), np.abs(wo[:, 2])) ** 2
+        floor = 1e-3 * scale.max(initial=0) + 1e-6
+        bad = np.abs(there - back) > relative[:, None] * scale + floor
+        j = np.argmax(bad.any(-1))
+        case.require(
+            not bad.any(), "(d) reciprocity", wi=wi[j], wo=wo[j], there=there[j], back=back[j], count=bad.sum()
+        )
+        bad = np.abs(there - radiance) > 1e-3 * scale + 1e-6 * scale.max(initial=0) + 1e-9
+        j = np.argmax(bad.any(-1))
+        case.require(not bad.any(), "(d) radiance scales with n²", wi=wi[j], wo=wo[j], there=there[j], got=radiance[j])
+
+
+# (f), (g), (h) --------------------------------------------------------------------------------------------------------
+def same(case: Case, other, oracle, tolerance=2e-4, **numbers):
+    """Whether another BSDF has the same values and densities."""
+    for wi, wo, texel in pairs(case):
+        a, b = case.evaluate(wi, wo, texel), case.evaluate(wi, wo, texel, bsdf=other)
+        for name, x, y in (("value", a[0], b[0]), ("pdf", a[1], b[1])):
+            scale = max(x.max(initial=0), y.max(initial=0))
+            bad = np.abs(x - y) > tolerance * np.maximum(x, y) + 1e-5 * scale + 1e-12
+            j = np.argmax(bad.any(-1))
+            case.require(
+                not bad.any(), oracle, what=name, wi=wi[j], wo=wo[j], got=y[j], wanted=x[j], count=bad.sum(), **numbers
+            )
+
+
+def update_is_a_fresh_scene(case: Case):
+    """(f) Another configuration, updated to this one by `mi.traverse`."""
+    c, changes, values = case.c, {}, {}
+    rng = np.random.default_rng(7)
+    factor = 0.5 + 0.4 * rng.random()
+    for name in ("orientation", "height_scale", "lateral_scale"):
+        value = getattr(c, name)
+        if name == "lateral_scale" and value == 1:
+            continue
+        changes[name] = tuple(factor * v for v in value) if isinstance(value, tuple) else factor * value
+        if isinstance(value, tuple):
+            values[f"{name}.data"] = np.float32(value).reshape(1, 4, 1)
+        else:
+            values[name + (".value" if name == "orientation" else "")] = value
+    if not isinstance(c.material, str) and c.material > 1.1:
+        lower = 1.02 + (c.material - 1.02) * factor
+        relative = (c.coat or c.outside) if c.transmission == "none" else c.outside
+        if abs(lower - c.outside) > 0.03 and (lower > c.outside) == (c.material > c.outside):
+            changes["material"] = lower
+            values["eta"] = c.material / relative
+    if c.film is not None:
+        changes["film"] = (c.film[0], factor * c.film[1])
+        values["thin_film_thickness"] = c.film[1]
+    if c.base is not None:
+        changes["base"] = factor * c.base
+        values["base.reflectance.value"] = c.base
+    # The spectrum is that of this configuration.
+    before = replace(c, **changes).dictionary(**({} if c.surface.by_name else {"spectrum": c.spectrum()}))
+    other = mi.load_dict(before)
+    parameters = mi.traverse(other)
+    for key, value in values.items():
+        case.require(key in parameters, "(f) parameters", missing=key, known=list(parameters.keys()))
+        parameters[key] = mi.TensorXf(value) if isinstance(value, np.ndarray) else mi.Float(value)
+    parameters.update()
+    same(case, other, "(f) update = fresh load", changed=list(values))
+
+
+def saved_is_in_memory(case: Case, folder):
+    """(g) A spectrum that was saved and loaded."""
+    if case.c.surface.by_name:
+        return
+    path = folder / "spectrum.exr"
+    path.unlink(missing_ok=True)
+    case.c.spectrum().save(path)
+    dictionary = case.c.dictionary(spectrum=None, filename=str(path))
+    same(case, mi.load_dict(dictionary), "(g) saved and loaded = in memory", 1e-5)
+
+
+def neutral_parameters_change_nothing(case: Case):
+    """(h) A film of no thickness or of an index beside it, a coat of the index outside, scales of one, 360°."""
+    c, plain, changed = case.c, {}, []
+    if c.film is None and c.material != "none":
+        changed.append(("film of no thickness", {"thin_film_ior": 2.0, "thin_film_thickness": 0.0}, {}))
+        index = c.coat or c.outside
+        if index > 1.01 or c.transmission != "none" or True:
+            changed.append(("film of the index above", {"thin_film_ior": float(index), "thin_film_thickness": 0.1}, {}))
+        changed.append(("film of the index below", {"thin_film_ior": c.material, "thin_film_thickness": 0.1}, {}))
+    if c.coat is None and c.transmission == "none":
+        changed.append(("coat of the index outside", {"coat_ior": c.outside, "ext_ior": c.outside}, {}))
+    if c.height_scale == 1:
+        changed.append(("texture of scales of one", {"height_scale": texture((1.0,) * 4)}, {}))
+    if isinstance(c.orientation, tuple):
+        changed.append(("360° more", {"orientation": texture(tuple(v + 360 for v in c.orientation))}, {}))
+    else:
+        changed.append(("360° more", {"orientation": c.orientation + 360.0}, {}))
+        changed.append(("texture of one orientation", {"orientation": texture((c.orientation,) * 4)}, {}))
+    del plain
+    for name, others, _ in changed:
+        same(case, mi.load_dict(c.dictionary(**others)), f"(h) {name} = without", 2e-3)
+
+
+ORACLES = {
+    "value": value_is_that_of_the_model,
+    "density": samples_have_their_density_and_average_to_the_integral,
+    "reciprocity": is_reciprocal,
+    "update": update_is_a_fresh_scene,
+    "saved": saved_is_in_memory,
+    "neutral": neutral_parameters_change_nothing,
+}
+
+
+def judge(configuration: Configuration, folder, oracles=tuple(ORACLES)):
+    """Apply oracles to a configuration."""
+    case = Case(configuration)
+    for name in oracles:
+        if name == "saved":
+            ORACLES[name](case, folder)
+        else:
+            ORACLES[name](case)
+    dr.sync_thread()

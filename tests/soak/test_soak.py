@@ -1,0 +1,115 @@
+"""Random configurations, judged by oracles that share no code with the plugin.
+
+    python -m pytest tests/soak                                    fixed seeds, about a minute
+    python -m pytest tests/soak --soak 120 --soak-seed 1000        two hours, from a seed on
+
+A failure shows the configuration, shrunk, and the seed with which it is found again. It becomes a case in `CASES`.
+"""
+
+import gc
+import time
+import traceback
+
+import hypothesis
+import pytest
+from hypothesis import HealthCheck, Phase, given, settings
+from soak_grammar import Configuration, Surface, configurations
+from soak_oracles import judge
+
+pytestmark = [
+    pytest.mark.filterwarnings("ignore:pixels of"),
+    pytest.mark.filterwarnings("ignore:terms"),
+    pytest.mark.filterwarnings("ignore:sample of"),
+]
+FIXED_SEED, FIXED_EXAMPLES = 1, 20
+EXAMPLES = 20  # of each seed of a long run
+SINUSOID = Surface("sinusoid", (2.5, 2.5), 0.3)
+CASES = {
+    # Orders beyond the critical angle of the coat were part of the sums of probabilities, but could not be drawn.
+    "coat over resolved orders": Configuration(
+        SINUSOID, coat=1.5, directions=((45.0, 0.0, 0), (80.0, 30.0, 0)), wavelengths=(550.0,) * 4
+    ),
+    "ruled grating under a coat": Configuration(
+        Surface("triangle", (0.8333, 0.8333), 0.2), material="Al", coat=1.5, directions=((30.0, 0.0, 0),)
+    ),
+    # E was that of the bare surface.
+    "aluminium film on an interface": Configuration(
+        Surface("sinusoid", (2.5, 2.5), 0.5),
+        material=1.5,
+        film=("Al", 0.05),
+        transmission="interface",
+        directions=((89.0, 0.0, 0),),
+    ),
+    "silver film on a sheet": Configuration(
+        Surface("sinusoid", (2.5, 2.5), 0.5),
+        material=1.5,
+        film=("Ag", 0.03),
+        transmission="sheet",
+        directions=((89.0, 0.0, 0),),
+    ),
+    "dense film on glass of nearly no index": Configuration(
+        Surface("sinusoid", (2.5, 2.5), 0.5),
+        material=1.05,
+        film=(2.35, 0.08),
+        transmission="interface",
+        directions=((89.0, 0.0, 0),),
+    ),
+}
+
+
+@pytest.mark.parametrize("name", CASES)
+def test_case(llvm, tmp_path, name):
+    judge(CASES[name], tmp_path)
+
+
+def test_random_configurations(llvm, tmp_path, pytestconfig, capsys):
+    minutes, seed = pytestconfig.getoption("--soak"), pytestconfig.getoption("--soak-seed")
+    if not minutes:
+        explore(FIXED_SEED if seed is None else seed, FIXED_EXAMPLES, tmp_path)
+        return
+    start = report = time.monotonic()
+    seed = time.time_ns() % 10**6 if seed is None else seed
+    tried, faults = 0, []
+    while time.monotonic() < start + 60 * minutes:
+        before = tried
+        try:
+            tried += explore(seed, EXAMPLES, tmp_path)
+        except Exception as error:
+            faults.append(seed)
+            with capsys.disabled():
+                print(f"\n--soak-seed {seed}: {''.join(traceback.format_exception_only(error))}", flush=True)
+        seed += 1
+        elapsed = time.monotonic() - start
+        if time.monotonic() > report + 300 or before == tried:
+            report = time.monotonic()
+            with capsys.disabled():
+                print(f"\n{elapsed / 60:.0f} min, seed {seed}, {tried} configurations without a fault", flush=True)
+    with capsys.disabled():
+        print(f"\n{tried} configurations, {60 * tried / elapsed:.1f} a minute, {len(faults)} faults: {faults}")
+    assert not faults
+
+
+def explore(seed, examples, folder):
+    """Judge random configurations of a seed; return how many."""
+    tried = []
+
+    @hypothesis.seed(seed)
+    @settings(
+        max_examples=examples,
+        phases=[Phase.generate, Phase.shrink],
+        deadline=None,
+        database=None,
+        derandomize=False,
+        report_multiple_bugs=False,
+        suppress_health_check=list(HealthCheck),
+    )
+    @given(configurations())
+    def judged(configuration):
+        tried.append(configuration)
+        try:
+            judge(configuration, folder)
+        finally:
+            gc.collect()
+
+    judged()
+    return len(tried)
