@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import functools
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import mitsuba as mi
 import numpy as np
@@ -101,6 +101,7 @@ class Configuration:
         orientation, height_scale, lateral_scale: numbers, or the values of four texels.
         directions: (θ, φ, texel): degrees from the normal and from x, and which texel is hit.
         wavelengths: those of a ray, nm.
+        render: whether pixels are rendered, which takes longer than all the rest.
     """
 
     surface: Surface = Surface()
@@ -119,6 +120,7 @@ class Configuration:
     shadowing: str = "v_cavity"
     conserve_energy: bool = True
     polarised: bool = False
+    render: bool = False
     directions: tuple = ((45.0, 0.0, 0),)
     wavelengths: tuple = (450.0, 500.0, 550.0, 620.0)
 
@@ -165,6 +167,8 @@ class Configuration:
             name = {"sinusoid": "sinusoidal", "triangle": "blazed"}[self.surface.kind]
             result |= {"profile": name, "period": self.surface.period[0], "depth": self.surface.depth}
             result |= {"coherence_length": self.coherence_length}
+            if self.representation != "auto":
+                result["representation"] = self.representation
         else:
             result["spectrum"] = self.spectrum()
         if isinstance(self.material, str):
@@ -256,16 +260,17 @@ def surfaces(draw, sample=False):
     other = period if is_line else draw(st.one_of(st.just(period), _geometric(0.6, 4.0)))
     shape = draw(st.one_of(st.just(1.0 if kind == "triangle" else 0.5), _rounded(0.05, 0.95)))
     count = draw(st.integers(1, 3)) if kind in ("harmonics", "random") else 1
-    can_name = kind == "sinusoid" or (kind == "triangle" and shape == 1)
+    turned = is_line and draw(st.booleans())
+    by_name = (kind == "sinusoid" or (kind == "triangle" and shape == 1)) and not turned and draw(st.booleans())
     return Surface(
         kind,
         (period, other),
         draw(_rounded(0.01, 1.2)),
         shape,
         draw(st.integers(0, 99)),
-        turned=is_line and draw(st.booleans()),
+        turned=turned,
         count=count,
-        by_name=False and can_name,
+        by_name=by_name,
     )
 
 
@@ -316,8 +321,15 @@ def configurations(draw):
         )
     # E of two-dimensional reliefs takes long, above all where scales vary.
     energy = draw(st.booleans() if surface.is_line else st.sampled_from([False, False, False, True]))
-    if not surface.is_line and energy:
+    if energy and not surface.is_line:
         lateral = 1.0
+    # As long as half a minute where both scales of a transmitting relief vary.
+    slow = energy and transmission != "none" and draw(st.integers(0, 9)) < 9
+    if slow and isinstance(lateral, tuple):
+        lateral = lateral[0]
+    heights = _numbers(0.05, 1.0, 1.0, surface.is_line or not energy)
+    if slow:
+        heights = heights.map(lambda scale: scale[0] if isinstance(scale, tuple) else scale)
     single = surface.count == 1 and not sample and surface.kind != "flat"
     representation = "auto"
     if single and surface.depth * densest < 0.8:
@@ -343,16 +355,12 @@ def configurations(draw):
         transmission=transmission,
         base=base,
         orientation=draw(_numbers(-360, 720, 0.0)),
-        height_scale=draw(_numbers(0.05, 1.0, 1.0, surface.is_line or not energy)),
+        height_scale=draw(heights),
         lateral_scale=lateral,
         shadowing=draw(st.sampled_from(["v_cavity", "v_cavity", "v_cavity", "none"])),
         conserve_energy=energy,
         polarised=draw(st.sampled_from([False] * 7 + [True])),
+        render=draw(st.sampled_from([False] * 11 + [True])),
         directions=tuple(draw(directions)),
         wavelengths=tuple(wavelengths),
     )
-
-
-def neutral(configuration):
-    """The same without what varies or multiplies, for the oracles that compare with a simpler scene."""
-    return replace(configuration, height_scale=1.0, lateral_scale=1.0)

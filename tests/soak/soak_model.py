@@ -6,6 +6,7 @@ All indices are absolute, lengths are in µm, wave vectors k = n ω in units of 
 from __future__ import annotations
 
 import functools
+import math
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -57,17 +58,11 @@ def horizon_gain():
     step = 0.01
     x = (np.arange(1200) + 0.5) * step
     kernel = np.exp(-((x[:, None] - x) ** 2) / 2) / np.sqrt(2 * np.pi) * step
-    tail = np.array([0.5 * (1 + float(np.sign(v)) * _erf(abs(v) / np.sqrt(2))) for v in x - x[-1] - step / 2])
+    tail = np.array([0.5 * (1 + math.erf(v / math.sqrt(2))) for v in x - x[-1] - step / 2])  # where g is one
     g = np.ones_like(x)
     for _ in range(400):
         g = np.sqrt(g / (kernel @ g + tail))
     return x, g
-
-
-def _erf(x):
-    import math
-
-    return math.erf(x)
 
 
 def gain(x):
@@ -247,8 +242,8 @@ class Model:
             result = result * self.of_plane(cos, True, wavelength)[1]
         return result * c.base / np.pi
 
-    def albedo(self, omega, wavelength, at, reflectance=True):
-        """R and T of a direction (3,) outside without E; R = T = 1 of opaque materials as in E."""
+    def albedo(self, omega, wavelength, at):
+        """R and T of a direction (3,) outside without E."""
         totals = []
         for below in (False, True) if self.c.transmission != "none" else (False,):
             m, wo = self.orders(omega, wavelength, below, at)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import functools
+import itertools
 from dataclasses import replace
 
 import drjit as dr
@@ -98,7 +99,7 @@ class Case:
 
 # (a) -----------------------------------------------------------------------------------------------------------------
 def value_is_that_of_the_model(case: Case):
-    """f at the centres of orders is that of the model, but for E, which is at most one, and one where nothing is gained."""
+    """f at the centres of orders is that of the model times E, which is at most one, and one where a ≤ 1."""
     c, model = case.c, case.model
     if not c.is_discrete or (c.polarised and (c.coat or c.transmission == "sheet" or c.film or c.base is not None)):
         return
@@ -118,7 +119,7 @@ def value_is_that_of_the_model(case: Case):
         ]
         for x in range(-reach[0], reach[0] + 1):
             for y in range(-reach[1], reach[1] + 1):
-                common, eta, lobe, found = model.terms(incident, wo, m + [x, y], wavelength, at)
+                common, eta, lobe, found = model.terms(incident, wo, m + np.array([x, y]), wavelength, at)
                 expected, slack = expected + common * eta * lobe, slack + common * lobe
                 kappa = found if (x, y) == (0, 0) else kappa
         faces = model.face(incident) * model.face(wo)
@@ -234,7 +235,7 @@ def square_about(centre, sigma, fine):
 def samples_have_their_density_and_average_to_the_integral(case: Case):
     """∫ pdf and ∫ eval over sets on a grid are the fraction of samples in it and their mean weight."""
     for k in range(len(case.directions)):
-        wo, weight, pdf, is_delta = case.samples[k]
+        wo, weight, pdf, _ = case.samples[k]
         case.require(np.isfinite(weight).all() and (weight >= 0).all(), "(b) weights", k=k, worst=np.min(weight))
         case.require(np.isfinite(pdf).all() and (pdf >= 0).all(), "(c) densities", k=k)
         case.require(
@@ -248,7 +249,7 @@ def samples_have_their_density_and_average_to_the_integral(case: Case):
 def mirror(case: Case, k):
     """The specular lobe of the face of a coat or sheet has the weight F."""
     c, (wi, _) = case.c, case.directions[k]
-    wo, weight, pdf, is_delta = case.samples[k]
+    _, weight, _, is_delta = case.samples[k]
     if c.coat:
         expected = plane(abs(wi[2]), c.outside, c.coat, 0.0, c.coat, 1.0)[0]
     elif c.transmission == "sheet" and wi[2] < 0:
@@ -350,7 +351,7 @@ def of_sphere(case: Case):
     for k, (wi, texel) in enumerate(case.directions):
         for below in case.sides:
             z, step = [], []
-            for low, high in zip(edges, edges[1:], strict=False):
+            for low, high in itertools.pairwise(edges):
                 z.append(np.linspace(low, high, per_ring + 1)[:-1])
                 step.append(np.full(per_ring, (high - low) / per_ring))
             z, step = np.concatenate(z), np.concatenate(step)
@@ -471,7 +472,8 @@ def update_is_a_fresh_scene(case: Case):
     if not isinstance(c.material, str) and c.material > 1.1:
         lower = 1.02 + (c.material - 1.02) * factor
         relative = (c.coat or c.outside) if c.transmission == "none" else c.outside
-        if abs(lower - c.outside) > 0.03 and (lower > c.outside) == (c.material > c.outside):
+        is_recipe = c.surface.by_name and c.transmission != "none"  # for the light inside of the first index
+        if abs(lower - c.outside) > 0.03 and (lower > c.outside) == (c.material > c.outside) and not is_recipe:
             changes["material"] = lower
             values["eta"] = c.material / relative
     if c.film is not None:
@@ -504,25 +506,95 @@ def saved_is_in_memory(case: Case, folder):
 
 def neutral_parameters_change_nothing(case: Case):
     """(h) A film of no thickness or of an index beside it, a coat of the index outside, scales of one, 360°."""
-    c, plain, changed = case.c, {}, []
+    c, changed = case.c, []
     if c.film is None and c.material != "none":
-        changed.append(("film of no thickness", {"thin_film_ior": 2.0, "thin_film_thickness": 0.0}, {}))
-        index = c.coat or c.outside
-        if index > 1.01 or c.transmission != "none" or True:
-            changed.append(("film of the index above", {"thin_film_ior": float(index), "thin_film_thickness": 0.1}, {}))
-        changed.append(("film of the index below", {"thin_film_ior": c.material, "thin_film_thickness": 0.1}, {}))
+        above = float(c.coat or c.outside)
+        changed += [
+            ("film of no thickness", {"thin_film_ior": 2.0, "thin_film_thickness": 0.0}),
+            ("film of the index above", {"thin_film_ior": above, "thin_film_thickness": 0.1}),
+            ("film of the index below", {"thin_film_ior": c.material, "thin_film_thickness": 0.1}),
+        ]
     if c.coat is None and c.transmission == "none":
-        changed.append(("coat of the index outside", {"coat_ior": c.outside, "ext_ior": c.outside}, {}))
+        changed.append(("coat of the index outside", {"coat_ior": c.outside, "ext_ior": c.outside}))
     if c.height_scale == 1:
-        changed.append(("texture of scales of one", {"height_scale": texture((1.0,) * 4)}, {}))
+        changed.append(("texture of scales of one", {"height_scale": texture((1.0,) * 4)}))
     if isinstance(c.orientation, tuple):
-        changed.append(("360° more", {"orientation": texture(tuple(v + 360 for v in c.orientation))}, {}))
+        changed.append(("360° more", {"orientation": texture(tuple(v + 360 for v in c.orientation))}))
     else:
-        changed.append(("360° more", {"orientation": c.orientation + 360.0}, {}))
-        changed.append(("texture of one orientation", {"orientation": texture((c.orientation,) * 4)}, {}))
-    del plain
-    for name, others, _ in changed:
+        changed.append(("360° more", {"orientation": c.orientation + 360.0}))
+        changed.append(("texture of one orientation", {"orientation": texture((c.orientation,) * 4)}))
+    for name, others in changed:
         same(case, mi.load_dict(c.dictionary(**others)), f"(h) {name} = without", 2e-3)
+
+
+# (i) -----------------------------------------------------------------------------------------------------------------
+PIXELS, SAMPLES_PER_PIXEL = 8, 1 << 13
+INTEGRATORS = {
+    "path": {"type": "path", "max_depth": 2},
+    "diffraction_path": {"type": "diffraction_path", "max_depth": 3},
+    "emitter samples": {"type": "direct", "emitter_samples": 1, "bsdf_samples": 0},
+}
+
+
+def integrators_agree(case: Case):
+    """(i) A plate under sky, lamp and sun looks the same whether its directions are drawn or the lights are."""
+    c = case.c
+    if c.polarised or not c.render:
+        return
+    c = replace(c, **{n: getattr(c.at(0), n) for n in ("orientation", "height_scale", "lateral_scale")})
+    wi, _ = case.directions[0]
+    if abs(wi[2]) < 0.05:  # the pixel would be wider than the plate
+        return
+    below = wi[2] < 0
+    z = -1.0 if below else 1.0
+    # Half above and half below, so that transmitted light is part of it.
+    lamp = np.array([0.5, 0.3, 0.8 * (1 if len(case.directions) == 1 or c.transmission == "none" else -1)]) * [1, 1, z]
+    uniform = {"type": "uniform", "value": 1.0}
+    lights = {
+        "sky": {"type": "constant", "radiance": uniform},
+        "lamp": {
+            **{"type": "sphere", "center": [float(v) for v in 4 * lamp], "radius": 1.2},
+            "emitter": {"type": "area", "radiance": uniform},
+        },
+        "sun": {"type": "directional", "direction": [float(v) for v in -lamp], "irradiance": uniform},
+    }
+    to_world = mi.ScalarTransform4f().look_at([float(v) for v in 3 * wi], [0, 0, 0], [0.1, 1, 0.2])
+    film = {"type": "hdrfilm", "width": PIXELS, "height": PIXELS, "rfilter": {"type": "box"}}
+    film |= {"pixel_format": "luminance", "component_format": "float32"}
+    sensor = {"type": "perspective", "fov": 0.05, "to_world": to_world, "film": film}
+    has_mirror = c.coat is not None or (c.transmission == "sheet" and below)
+    for name, light in lights.items():
+        plate = {"type": "rectangle", "bsdf": c.dictionary()}
+        scene = mi.load_dict({"type": "scene", "sensor": sensor, "plate": plate, "light": light})
+        means, errors = {}, {}
+        for integrator, dictionary in INTEGRATORS.items():
+            if integrator == "emitter samples" and name == "lamp" and has_mirror:
+                continue
+            image = mi.render(scene, integrator=mi.load_dict(dictionary), spp=SAMPLES_PER_PIXEL, seed=len(means))
+            pixels = np.array(image, float).ravel()
+            means[integrator], errors[integrator] = pixels.mean(), pixels.std() / PIXELS
+        if "emitter samples" in means and name == "sky" and has_mirror:
+            n = c.coat or c.material
+            mirror = float(plane(abs(wi[2]), c.outside, n, 0.0, n, 1.0)[0])
+            means["emitter samples"] += mirror * luminance_of_one()
+        for integrator in list(means)[1:]:
+            error = DEVIATIONS * np.hypot(errors["path"], errors[integrator]) + QUADRATURE * means["path"]
+            case.require(
+                abs(means["path"] - means[integrator]) < error + 1e-6,
+                f"(i) path = {integrator} under {name}",
+                means=means,
+                errors=errors,
+                wi=wi,
+            )
+
+
+@functools.cache
+def luminance_of_one():
+    """What a pixel shows of the sky alone."""
+    sky = {"type": "constant", "radiance": {"type": "uniform", "value": 1.0}}
+    film = {"type": "hdrfilm", "width": 16, "height": 16, "pixel_format": "luminance", "component_format": "float32"}
+    scene = mi.load_dict({"type": "scene", "sensor": {"type": "perspective", "film": film}, "sky": sky})
+    return np.array(mi.render(scene, integrator=mi.load_dict({"type": "path"}), spp=4096)).mean()
 
 
 ORACLES = {
@@ -532,6 +604,7 @@ ORACLES = {
     "update": update_is_a_fresh_scene,
     "saved": saved_is_in_memory,
     "neutral": neutral_parameters_change_nothing,
+    "integrators": integrators_agree,
 }
 
 
