@@ -1,7 +1,7 @@
 """Compute the stored rigorous results: `python precompute/rigorous_reference.py [OUT.json]`.
 
-Needs the extra "rigorous" (meent); about ten minutes on two cores. `scalar_theory.py` and `validation/coupled_waves.py`
-read them.
+Needs the extra "reference" (meent); about ten minutes on two cores. `scalar_theory.py` and
+`validation/coupled_waves.py` read them.
 """
 
 from __future__ import annotations

@@ -23,7 +23,8 @@ from bsdf_support import use  # isort: skip
 from mitsuba_diffraction.render import passes
 
 # One example may be the first to import or to compile something.
-settings.register_profile("tests", deadline=None, max_examples=30)
+# CI draws the same examples each time, so that a failure is of the change; slow tests draw others.
+settings.register_profile("tests", deadline=None, max_examples=30, derandomize="CI" in os.environ)
 settings.register_profile("slow", deadline=None, max_examples=200)
 
 MEASURED = Path(__file__).parents[1] / "precompute" / "measured"

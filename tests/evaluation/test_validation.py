@@ -293,7 +293,7 @@ def test_stored_results_conserve_energy_and_are_converged():
 
 def solver(monkeypatch, name="coupled_waves"):
     """A module of precompute/."""
-    pytest.importorskip("meent", reason="the extra 'rigorous' is not installed")
+    pytest.importorskip("meent", reason="the extra 'reference' is not installed")
     monkeypatch.syspath_prepend(PRECOMPUTE)
     return importlib.import_module(name)
 
