@@ -237,6 +237,13 @@ NANOSCOPE = {
         (10, 5),
         None,
     ),
+    "slow_axis_stopped.spm": (
+        {"Scan Size": "10000 nm", "Slow Axis Size": "10000 nm", "Samps/line": 32, "Lines": 32, "Aspect Ratio": "1:1"},
+        {"Aspect Ratio": "0.516184", "Scan Size": "10 10 ~m"},
+        (32, 22),
+        (10, 10 * 22 / 32),
+        None,
+    ),
     "oblong_pixels.spm": (
         {"Scan Size": "600 nm", "Samps/line": 32, "Lines": 16, "Aspect Ratio": "1:1"},
         {"Aspect Ratio": "1:1", "Scan Size": "600 600 nm"},
