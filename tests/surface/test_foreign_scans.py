@@ -1,6 +1,7 @@
 """Instruments' files of kinds that SurfaceTopography misreads or refuses, or that need a language."""
 
 import re
+import struct
 from contextlib import nullcontext
 
 import foreign_scans
@@ -149,6 +150,14 @@ def test_named_columns_of_an_igor_wave_are_curves(tmp_path):
     (tmp_path / "scan.ibw").write_bytes(ibw(column_names=["Raw", "Deflection", *map(str, range(ROWS - 2))]))
     with pytest.raises(ValueError, match=r"wanted a channel of heights .* got 0 'Raw', 1 'Deflection'"):
         read_height_field(tmp_path / "scan.ibw")
+
+
+@needs_the_extra
+def test_a_damaged_igor_wave_is_refused_in_one_line(tmp_path, caplog):
+    (tmp_path / "scan.ibw").write_bytes(ibw(layers=1).replace(struct.pack("<3i", COLUMNS, ROWS, 1), b"\x09" * 12))
+    with pytest.raises(ValueError, match="not read as a file of Igor binary wave"):
+        read_height_field(tmp_path / "scan.ibw")
+    assert not caplog.records
 
 
 @needs_the_extra

@@ -5,9 +5,12 @@ The extension determines the reader: the library would otherwise also try genera
 
 from __future__ import annotations
 
+import logging
 import re
 import warnings
 import zipfile
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 
 import numpy as np
@@ -48,7 +51,7 @@ def format_of(extension: str) -> str | None:
 
 def read(path: Path, unit: str | tuple[str, str] | None, channel: str | int | None, extension: str) -> Scan:
     """Read one channel of an instrument file of that extension; the top row of its image is row 0."""
-    with warnings.catch_warnings():
+    with warnings.catch_warnings(), _quiet():
         warnings.simplefilter("ignore")  # of the library, on optional dependencies and metadata
         try:
             from SurfaceTopography.IO import lookup_reader_by_format
@@ -91,16 +94,28 @@ def read(path: Path, unit: str | tuple[str, str] | None, channel: str | int | No
             heights, factor = mended.nms(path, heights)
             along *= factor
     rows, columns = heights.shape
-    doubt, metadata = doubts[chosen.number] if doubts else "", source.info.get("raw_metadata", {})
+    doubt = doubts[chosen.number] if doubts else ""
     if not own and size == (columns, rows):
         size = None  # without a unit these are pixels
     if name == "jpk":
-        x, y, doubt = mended.jpk(metadata, heights.shape)
+        x, y, doubt = mended.jpk(source.info["raw_metadata"], heights.shape)
         size = x * size[0], y * size[1]
     if name == "ibw" and size is not None:
-        doubt = mended.ibw(metadata, (along * size[0], along * size[1]), heights.shape)
+        note = source.info.get("raw_metadata", {})
+        doubt = mended.ibw(note, (along * size[0], along * size[1]), heights.shape)
     pixel_size = (size[0] * along / columns, size[1] * along / rows) if size is not None else None
     return Scan(heights * high, pixel_size, chosen.name, doubt)
+
+
+@contextmanager
+def _quiet() -> Iterator[None]:
+    """Silence loggers: those of the library print what a damaged file holds, in full."""
+    before = logging.root.manager.disable
+    logging.disable()
+    try:
+        yield
+    finally:
+        logging.disable(before)
 
 
 def _refuse_bomb(path: Path) -> None:

@@ -183,8 +183,10 @@ def ibw(note: dict[str, str], size: tuple[float, float], shape: tuple[int, int])
 
 def jpk(metadata: dict[str, Any], shape: tuple[int, int]) -> tuple[float, float, str]:
     """Return the part of the grid that an image of JPK covers, along x and y, and `Scan.doubt`."""
-    columns, rows = (int(metadata.get(name, count)) for name, count in zip(_JPK_GRID, shape[::-1], strict=True))
-    if (columns, rows) == shape[::-1] or not (columns > 0 and rows > 0):
+    columns, rows = (metadata.get(name) for name in _JPK_GRID)
+    if not (isinstance(columns, int) and isinstance(rows, int) and min(columns, rows) > 0):
+        return 1.0, 1.0, ""
+    if (columns, rows) == shape[::-1]:
         return 1.0, 1.0, ""
     part = f"an image of {shape[1]} × {shape[0]} pixels, of a grid of {columns} × {rows}"
     return shape[1] / columns, shape[0] / rows, f"{part}: taken for a part of the size of the grid"
