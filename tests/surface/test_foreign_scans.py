@@ -37,6 +37,7 @@ INSTRUMENTS = {
     "image.jpk-qi-image": (jpk, {}),
     "image.tif": (jpk, {}),
     "curves.jpk-qi-data": (jpk, {"image": "data-image.jpk-qi-image"}),
+    "curves.zip": (jpk, {"image": "data-image.jpk-qi-image"}),
     "curves.jpk-force-map": (jpk, {"image": "data-image.force"}),
 }
 INTERFEROMETERS = {
@@ -189,8 +190,12 @@ def test_curves_of_jpk_are_not_unpacked(tmp_path, monkeypatch):
     with pytest.raises(ValueError, match=r"got an image of .* wanted at most 1000"):
         read_height_field(tmp_path / "scan.jpk-qi-data")
     (tmp_path / "scan.jpk-qi-data").write_bytes(jpk(image="data-image.other"))
-    with pytest.raises(ValueError, match=r"an archive without an image of the heights .* save that image .* as \.jpk"):
-        read_height_field(tmp_path / "scan.jpk-qi-data")
+    (tmp_path / "scan.jpk-force").write_bytes(jpk(image="data-image.other"))
+    for name in ("scan.jpk-qi-data", "scan.jpk-force"):
+        with pytest.raises(
+            ValueError, match=r"an archive without an image of the heights .* save that image .* as \.jpk"
+        ):
+            read_height_field(tmp_path / name)
 
 
 # Name → settings of the scan, fields of the image, its columns and lines, its size in µm, and what is in doubt.

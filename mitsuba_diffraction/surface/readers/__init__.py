@@ -19,7 +19,7 @@ from ...errors import RequestError, is_number
 from ...files import refuse_special
 from ...settings import Settings
 from ..heightfield import HeightField
-from . import gwyddion, instruments, interferometers, pictures, text
+from . import gwyddion, instruments, interferometers, mended, pictures, text
 from .scan import Scan, micrometres, pair
 
 __all__ = ["read_height_field"]
@@ -219,7 +219,8 @@ def _extension_of_content(path: Path) -> str:
         start = stream.read(_HEADER_BYTES)
     if text.is_gwyddion_export(start):
         return ".asc"
-    return next((extension for magic, extension in _MAGIC.items() if start.startswith(magic)), path.suffix.lower())
+    found = next((extension for magic, extension in _MAGIC.items() if start.startswith(magic)), path.suffix.lower())
+    return ".jpk-qi-data" if found == ".x3p" and mended.is_jpk(path) else found
 
 
 def _as_micrometres(numbers: NDArray, height_range: float | None) -> NDArray[np.float64]:

@@ -21,6 +21,7 @@ import struct
 import zipfile
 import zlib
 from collections.abc import Callable
+from contextlib import suppress
 from pathlib import Path
 from typing import Any
 from xml.etree import ElementTree
@@ -57,6 +58,13 @@ def rewritten(path: Path, name: str) -> tuple[str | io.BytesIO, list[str]]:
     data = path.read_bytes()
     data, doubts = nanoscope.rewritten(data) if name == "di" else (_REWRITE[name](data), [])
     return io.BytesIO(data), doubts
+
+
+def is_jpk(path: Path) -> bool:
+    """Return whether a file is an archive of force curves of JPK."""
+    with suppress(zipfile.BadZipFile, NotImplementedError, ValueError), zipfile.ZipFile(path) as archive:
+        return "header.properties" in archive.namelist()
+    return False
 
 
 def _jpk_image(path: Path) -> bytes:
