@@ -104,6 +104,13 @@ def XYZ_to_linear_sRGB(XYZ: NDArray[np.floating]) -> NDArray[np.float64]:
     return XYZ @ colour.RGB_COLOURSPACES["sRGB"].matrix_XYZ_to_RGB.T
 
 
+def linear_sRGB_to_XYZ(rgb: NDArray[np.floating]) -> NDArray[np.float64]:
+    """Convert linear sRGB to XYZ, (..., 3) each."""
+    import colour
+
+    return rgb @ colour.RGB_COLOURSPACES["sRGB"].matrix_RGB_to_XYZ.T
+
+
 def delta_E(XYZ_1: ArrayLike, XYZ_2: ArrayLike) -> NDArray[np.float64]:
     """Compute the colour difference CIEDE2000 (CIE 142, ISO/CIE 11664-6) relative to D65 with Y = 1.
 
@@ -121,6 +128,70 @@ def daylight(wavelengths: ArrayLike) -> NDArray[np.float64]:
 
     table = colour.SDS_ILLUMINANTS["D65"]
     return np.interp(np.asarray(wavelengths), table.wavelengths, table.values) / 100
+
+
+def lamp_to_linear_sRGB(wavelengths: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Return the matrix from fractions of a lamp's light at wavelengths in nm to linear sRGB, (n, 3).
+
+    The lamp is daylight between the first and the last wavelength, fractions are linear between them, and all of its
+    light is white. Light of one wavelength, or within 2 nm, is shown as grey.
+    """
+    first, last = wavelengths.min(), wavelengths.max()
+    count = len(wavelengths)
+    if last - first < 2:
+        return np.full((count, 3), 1 / count)
+    shown = np.linspace(first, last, min(41, 1 + int(last - first)))
+    order = np.argsort(wavelengths)
+    hats = np.stack([np.interp(shown, wavelengths[order], one) for one in np.eye(count)[:, order]])
+    return spectrum_to_linear_sRGB(hats * daylight(shown), shown) / spectrum_to_linear_sRGB(daylight(shown), shown)
+
+
+_UPSAMPLING_STEPS, _MIN_DAMPING = 60, 1e-9
+_DARK = 216 / 24389  # below which lightness is linear, as in CIE L*
+
+
+def upsampled(rgb: NDArray[np.floating], matrix: NDArray[np.floating]) -> NDArray[np.float64]:
+    """Return smooth spectra from 0 to 1 that have colours, (..., 3) → (..., n), where `matrix` allows them.
+
+    Each is ½ + p/(2 √(1 + p²)), p a parabola over the wavelengths (Jakob and Hanika 2019, A low-dimensional function
+    space for efficient spectral upsampling), fitted by damped Gauss–Newton steps to the cube roots of linear sRGB, in
+    which steps are about as large as they look.
+
+    Args:
+        rgb: linear sRGB from 0 to 1.
+        matrix: from a spectrum at n wavelengths in ascending order to linear sRGB, (n, 3).
+    """
+    colours, index = np.unique(np.reshape(rgb, (-1, 3)), axis=0, return_inverse=True)
+    x = np.linspace(-1, 1, len(matrix)) if len(matrix) > 1 else np.zeros(1)
+    powers = np.stack([np.ones_like(x), x, x**2], axis=-1)
+
+    def lightness(values: NDArray[np.floating]) -> NDArray[np.floating]:
+        return np.where(values > _DARK, np.cbrt(values), (values / _DARK + 2) * np.cbrt(_DARK) / 3)
+
+    def spectra_of(c: NDArray[np.float64]) -> NDArray[np.float64]:
+        p = c @ powers.T
+        return 0.5 + p / (2 * np.sqrt(1 + p**2))
+
+    def residual(c: NDArray[np.float64]) -> NDArray[np.float64]:
+        return lightness(spectra_of(c) @ matrix) - lightness(colours)
+
+    mean = np.clip(colours.mean(axis=-1), 0.01, 0.99)
+    c = np.zeros((len(colours), 3))
+    c[:, 0] = (2 * mean - 1) / np.sqrt(1 - (2 * mean - 1) ** 2)
+    damping, error = np.full(len(c), 1e-2), (residual(c) ** 2).sum(axis=-1)
+    for _ in range(_UPSAMPLING_STEPS):
+        p = c @ powers.T
+        slope = (0.5 / (1 + p**2) ** 1.5)[..., None] * powers  # (colours, n, 3)
+        reached = np.maximum(spectra_of(c) @ matrix, _DARK)
+        jacobian = np.einsum("nk,cnj->ckj", matrix, slope) / (3 * np.cbrt(reached**2))[..., None]
+        normal = jacobian.swapaxes(1, 2) @ jacobian
+        normal += np.eye(3) * (damping * (1e-12 + normal.trace(axis1=1, axis2=2)))[:, None, None]
+        step = np.linalg.solve(normal, (jacobian.swapaxes(1, 2) @ residual(c)[..., None]))[..., 0]
+        found = (residual(c - step) ** 2).sum(axis=-1)
+        better = found < error
+        c, error = np.where(better[:, None], c - step, c), np.where(better, found, error)
+        damping = np.clip(np.where(better, damping / 4, damping * 8), _MIN_DAMPING, 1 / _MIN_DAMPING)
+    return spectra_of(c)[index].reshape(*np.shape(rgb)[:-1], len(matrix))
 
 
 def into_gamut(rgb: NDArray[np.floating]) -> NDArray[np.float64]:
@@ -188,6 +259,13 @@ def neutral_view(rgb: NDArray[np.floating]) -> NDArray[np.floating]:
     import colour
 
     return colour.cctf_encoding(roll_off(rgb), function="sRGB")
+
+
+def plain_view(rgb: NDArray[np.floating]) -> NDArray[np.floating]:
+    """Encode exposed, non-negative linear sRGB for a display: the transfer function of sRGB alone, clipped at one."""
+    import colour
+
+    return colour.cctf_encoding(np.minimum(rgb, 1.0), function="sRGB")
 
 
 def ocio_view(name: str) -> View:

@@ -22,7 +22,7 @@ from .render import Stopped
 
 
 def design(
-    target: Annotated[Path, typer.Argument(metavar="TARGET.png", help="the picture to cast, grey or RGB, opaque")],
+    target: Annotated[Path, typer.Argument(metavar="TARGET.png", help="the picture to cast, grey or RGB")],
     output: Annotated[
         Path | None, typer.Option("-o", "--output", help="relief (.gsf, .tif); default: ./TARGET_relief.gsf")
     ] = None,
@@ -38,6 +38,14 @@ def design(
     int_ior: Annotated[
         float | None, typer.Option(help="index of a sheet that transmits the light; default: the relief reflects")
     ] = None,
+    seen_on: Annotated[
+        str, typer.Option(help="wall (seen from the side of the plate) or screen (translucent, from the other side)")
+    ] = "wall",
+    invert: Annotated[bool, typer.Option("--invert", help="cast what is dark in the picture")] = False,
+    unused: Annotated[
+        str,
+        typer.Option(help="where light goes that the colours cannot use: outside (of the frame), or mirror (order 0)"),
+    ] = "outside",
     levels: Annotated[int | None, typer.Option(help="number of equidistant heights; default: continuous")] = None,
     tool_blur: Annotated[float, typer.Option(help="standard deviation of the tool's blur, µm")] = 0.13,
     starts: Annotated[int, typer.Option(help="random reliefs, of which the best is continued; more take longer")] = 24,
@@ -48,10 +56,13 @@ def design(
     default = free_name(f"{target.stem}_relief", lambda stem: [Path(stem + suffix) for suffix in SUFFIXES], [target])
     path = output or Path(f"{default}.gsf")
     check_suffix("-o", path, ".gsf", ".tif")
-    picture = read_target(target)
+    picture = read_target(target, invert=invert)
     check_outputs([target], [("-o", path.with_suffix(suffix)) for suffix in SUFFIXES], overwrite=overwrite)
-    if picture.shape[0] != picture.shape[1]:
-        say("note", f"{target} has {picture.shape[1]} × {picture.shape[0]} pixels, and is cast as a square")
+    if picture.max() == 0:
+        help_ = "" if invert else "; --invert casts what is dark"
+        raise RequestError(f"{target}: got {'white' if invert else 'black'} alone, wanted light somewhere{help_}")
+    if not invert and _is_dark_on_light(picture):
+        say("note", f"{target} is light up to its edges; --invert casts what is dark in it, with more contrast")
     wavelengths = None if wavelength is None else numbers("--wavelength", wavelength).tolist()
     with progress_bar(f"design of {target.name}", "iterations") as progress:
         found = search(
@@ -63,6 +74,8 @@ def design(
             wavelengths,
             int_ior,
             levels,
+            seen_on=seen_on,
+            unused=unused,
             tool_blur=tool_blur,
             starts=starts,
             seed=seed,
@@ -86,8 +99,10 @@ def design(
         raise Stopped(f"{relief} holds the best relief so far")
 
 
-def read_target(path: Path) -> NDArray[np.float64]:
+def read_target(path: Path, invert: bool = False) -> NDArray[np.float64]:
     """Return linear radiance from 0 to 1, (rows, columns) or (rows, columns, 3), of a picture in sRGB.
+
+    What is transparent is dark. With `invert`, the radiance is that of the negative, where the picture is opaque.
 
     Raises:
         FileNotFoundError: if there is no such file.
@@ -97,12 +112,12 @@ def read_target(path: Path) -> NDArray[np.float64]:
     try:
         with Image.open(path) as opened:
             image = ImageOps.exif_transpose(opened)
-            has_alpha = image.mode.endswith("A") and image.getextrema()[-1] != (255, 255)
-            if has_alpha or "transparency" in image.info:
-                raise RequestError(f"{path}: got a picture with alpha, wanted an opaque one")
             # Pillow opens PGM files of 16 bits, and older versions PNG files, as integers of 32 bits.
             if image.mode == "F" or (image.mode == "I" and opened.format not in ("PNG", "PPM")):
                 raise RequestError(f"{path}: got numbers of 32 bits, wanted a picture of 8 or 16 bits per channel")
+            alpha: NDArray[np.float64] | float = 1.0
+            if image.mode.endswith(("A", "a")) or "transparency" in image.info:
+                alpha = np.asarray(image.convert("RGBA"), np.float64)[..., 3] / 255
             if image.mode.startswith("I"):
                 encoded = np.asarray(image, np.float64) / 65535
             else:
@@ -113,8 +128,18 @@ def read_target(path: Path) -> NDArray[np.float64]:
         raise RequestError(f"{path}: not a picture that can be read ({error})") from None
     if encoded.ndim == 3 and (encoded == encoded[..., :1]).all():
         encoded = encoded[..., 0]
+    if invert:
+        encoded = 1 - encoded
     # IEC 61966-2-1.
-    return np.where(encoded <= 0.04045, encoded / 12.92, ((encoded + 0.055) / 1.055) ** 2.4)
+    linear = np.where(encoded <= 0.04045, encoded / 12.92, ((encoded + 0.055) / 1.055) ** 2.4)
+    return linear * (alpha if encoded.ndim == 2 or isinstance(alpha, float) else alpha[..., None])
+
+
+def _is_dark_on_light(picture: NDArray[np.float64]) -> bool:
+    """Return whether most of the edge of a picture is bright, as that of a sheet of paper."""
+    grey = picture if picture.ndim == 2 else picture.mean(axis=-1)
+    edge = np.concatenate([grey[0], grey[-1], grey[:, 0], grey[:, -1]])
+    return bool(np.median(edge) > grey.max() / 2)
 
 
 def _report(found: Design) -> None:
@@ -125,3 +150,5 @@ def _report(found: Design) -> None:
         for wavelength, light, correlation, unevenness, *rest in zip(*measures, *found.changed.values(), strict=True)
     ]
     show(table(columns, rows), width=130)
+    if not np.isnan(found.colour_difference):
+        tell(f"ΔE00 of target and prediction: {found.colour_difference:.1f}, a mean over the frame")

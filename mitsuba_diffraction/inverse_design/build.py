@@ -18,11 +18,10 @@ from ..settings import MIN_WAVELENGTH
 from .far_field import Array, FarField, lobes_in_bins, nearest_levels
 from .plate import Plate
 from .result import Design
+from .target import wanted_fractions, with_unused
 
 _WHITE = 1e3 / np.linspace(1e3 / 430, 1e3 / 670, 8)  # nm, equidistant in 1/λ
-_CHANNELS = (620.0, 540.0, 460.0)  # nm, of the red, green and blue of a target; linear between them
 _COARSE, _FINE = 3, 6  # pixels along a texel: of the first searches, and of the last
-_BINS_PER_ORDER = 1.5
 _FIRST_ITERATIONS, _LAST_ITERATIONS = 75, 400
 _FIXED_FRACTIONS = (0.4, 0.7, 0.9, 1.0)  # of the texels, that are set to levels one round after the other
 _CORRECTIONS, _TOLERANCE = 20, 1e-8  # of L-BFGS-B: stored steps, and the decrease of L at which it ends
@@ -39,6 +38,8 @@ def design(
     int_ior: float | None = None,
     levels: int | None = None,
     *,
+    seen_on: str = "wall",
+    unused: str = "outside",
     tool_blur: float = 0.13,
     starts: int = 24,
     seed: int = 0,
@@ -52,10 +53,9 @@ def design(
     random reliefs. The coherence length is half the period, so that the orders merge into a picture.
 
     Args:
-        target: the wanted radiance, (rows, columns), or (rows, columns, 3) for red, green and blue; ≥ 0, linear, rows
-            from the top. As seen on a screen: its right is +x of ω_o, its top +y, and the middles of its edges are at
-            direction cosines of ±sin(angle). All light of a wavelength is wanted in the target; that of a wavelength
-            between 620, 540 and 460 nm is the linear interpolation of red, green and blue.
+        target: the wanted radiance, (rows, columns), or (rows, columns, 3) for linear sRGB; ≥ 0, rows from the top, as
+            it is to be seen. Pixels are squares; the middles of the edges of the frame are at direction cosines of
+            ±sin(angle), and its top is +y of ω_o.
         texel: side of a texel, µm.
         texels: along the period.
         height_range: largest difference of heights, µm.
@@ -63,6 +63,9 @@ def design(
         wavelengths: nm, one number for a laser; by default white light, 430–670 nm.
         int_ior: index of a sheet that transmits the light, which falls on its relief; by default the relief reflects.
         levels: number of equidistant heights; by default they are continuous.
+        seen_on: "wall": seen from the side of the plate; "screen": a translucent one, seen from the other side.
+        unused: where light goes that the colours of the target cannot use: "outside" of the frame, or in "mirror"
+            direction, order 0.
         tool_blur: standard deviation of the Gaussian by which the tool blurs heights, µm; 0 for none.
         starts: random reliefs from which the search begins; the best of them is continued.
         seed: of the random reliefs.
@@ -83,11 +86,13 @@ def design(
         int_ior=int_ior,
         levels=levels,
         tool_blur=tool_blur,
+        seen_on=seen_on,
+        unused=unused,
     )
     check_whole("starts", starts, 1)
     check_whole("seed", seed, 0)
     wanted = wanted_fractions(target, plate)
-    search = _Search(plate, wanted, starts, progress)
+    search = _Search(plate, with_unused(wanted, plate), starts, progress)
     interrupted = False
     try:
         search(seed)
@@ -96,6 +101,8 @@ def design(
     heights = search.heights
     if plate.levels is not None:  # interrupted, some may not be set yet
         heights = nearest_levels(heights, plate.height_range, plate.levels)
+    if plate.mirrored:  # m_x of each order changes its sign
+        heights, wanted = heights[:, ::-1], wanted[..., ::-1]
     return Design.of(heights, plate, wanted, interrupted)
 
 
@@ -108,53 +115,6 @@ def _wavelengths(given: float | Sequence[float] | None) -> Array:
     if found.ndim != 1 or not found.size or not ((found >= MIN_WAVELENGTH) & (found < np.inf)).all():
         raise RequestError(f"wavelengths: got {given!r}, wanted one or several in nm, from {MIN_WAVELENGTH:g} nm on")
     return found
-
-
-def wanted_fractions(target: ArrayLike, plate: Plate) -> Array:
-    """Return t, the wanted fraction of the light in each bin, (w, bins, bins), rows ↔ +y.
-
-    Raises:
-        ValueError: if the target is not a picture, is black at a wavelength, or lies in the mirror direction.
-    """
-    try:
-        picture = np.asarray(target, np.float64)
-    except (TypeError, ValueError):
-        raise RequestError(f"target: got {type(target).__name__}, wanted an array of numbers") from None
-    if picture.ndim == 3 and picture.shape[2] in (2, 4):
-        raise RequestError(f"target: got shape {picture.shape}, with alpha; wanted an opaque picture, grey or RGB")
-    if picture.size == 0 or not (picture.ndim == 2 or (picture.ndim == 3 and picture.shape[2] == 3)):
-        raise RequestError(f"target: got shape {picture.shape}, wanted (rows, columns) or (rows, columns, 3)")
-    if not (np.isfinite(picture).all() and picture.min() >= 0):
-        raise RequestError(
-            f"target: got {np.count_nonzero(~(picture >= 0) | np.isinf(picture))} values that are negative or not "
-            "finite, wanted linear radiance ≥ 0"
-        )
-    channels = picture[..., None] if picture.ndim == 2 else picture
-    count = math.ceil(_BINS_PER_ORDER * plate.orders_across)
-    rows, columns = (_overlaps(size, count) for size in channels.shape[:2])
-    binned = np.einsum("ir,rcs,jc->sij", rows, channels[::-1], columns)
-    if len(binned) == 3:
-        weights = np.stack([np.interp(plate.wavelengths, _CHANNELS[::-1], one) for one in np.eye(3)[:, ::-1]])
-        binned = np.einsum("sw,sij->wij", weights, binned)
-    else:
-        binned = np.repeat(binned, len(plate.wavelengths), axis=0)
-    near = np.hypot(*np.meshgrid(*2 * [(plate.edges(count)[1:] + plate.edges(count)[:-1]) / 2])) < plate.pitch
-    for wavelength, one in zip(plate.wavelengths, binned, strict=True):
-        if one.sum() == 0:
-            raise RequestError(f"target: got black at {wavelength:g} nm, wanted light somewhere")
-        if one[~near].sum() == 0:
-            raise RequestError(
-                f"target: at {wavelength:g} nm it is the mirror direction only (within {plate.pitch:.2g} of it), into "
-                "which a flat plate sends all light; wanted light elsewhere, too"
-            )
-    return binned / binned.sum(axis=(1, 2), keepdims=True)
-
-
-def _overlaps(pixels: int, bins: int) -> Array:
-    """Return the fraction of each pixel in each bin of the same length in all, (bins, pixels)."""
-    edges = np.linspace(0, pixels, bins + 1)
-    below = np.clip(edges[:, None] - np.arange(pixels), 0, 1)
-    return np.diff(below, axis=0)
 
 
 def far_field_of(

@@ -3,10 +3,11 @@
 z = U h Uᵀ                                   heights of the pixels, from those of the texels, h (`blurred_texels`)
 η_m = |F_m|²,  F = fft2(e^{iκz})/N           power of each order, for light along the normal
 P = A_y η A_xᵀ                               power in each bin of direction cosines (`lobes_in_bins`)
-L_λ = Σ (P − t)²/Σ t²                        t the wanted fraction of the light, Σ over bins
+L_λ = Σ (P − t)²/s                           t the wanted fraction of the light, Σ over bins
+s = max Σ t²                                 over the wavelengths: unwanted light counts as much at each of them
 L = (mean L_λ³)^⅓                            over the wavelengths: the larger ones count more
 
-∂L/∂P = (L_λ/L)²/w · 2 (P − t)/Σ t²,   ∂L/∂η = g = A_yᵀ ∂L/∂P A_x,   w the number of wavelengths
+∂L/∂P = (L_λ/L)²/w · 2 (P − t)/s,   ∂L/∂η = g = A_yᵀ ∂L/∂P A_x,   w the number of wavelengths
 ∂L/∂z = 2 Re[conj(iκ e^{iκz}) · ifft2(g F)],   ∂L/∂h = Uᵀ ∂L/∂z U
 """
 
@@ -65,7 +66,7 @@ class FarField:
         kappa: κ of each wavelength, (w,) rad/µm.
         lobes: A of each wavelength, (w, bins, pixels), orders as in `scipy.fft.fftfreq`, the same along x and y. Its
             precision is that of the FFTs.
-        wanted: t, (w, bins, bins), rows ↔ +y; sums to one for each wavelength.
+        wanted: t, (w, bins, bins), rows ↔ +y; sums to one at most for each wavelength.
     """
 
     texels: Array
@@ -85,11 +86,11 @@ class FarField:
         wave = np.cos(phase) + 1j * np.sin(phase)
         amplitudes = scipy.fft.fft2(wave, norm="forward")
         difference = self.lobes @ (amplitudes.real**2 + amplitudes.imag**2) @ transposed - self.wanted
-        scale = (self.wanted**2).sum(axis=(1, 2))
+        scale = (self.wanted**2).sum(axis=(1, 2)).max()
         of_wavelengths = (difference**2).sum(axis=(1, 2)) / scale
         value = float(np.cbrt((of_wavelengths**3).mean()))
         weight = (of_wavelengths / value) ** 2 / len(of_wavelengths)
-        of_predicted = weight[:, None, None] * (2 * difference / scale[:, None, None])
+        of_predicted = weight[:, None, None] * (2 * difference / scale)
         g = transposed @ of_predicted.astype(dtype) @ self.lobes
         back = scipy.fft.ifft2(g * amplitudes)
         gradient = (2 * kappa * (wave.real * back.imag - wave.imag * back.real)).sum(axis=0)

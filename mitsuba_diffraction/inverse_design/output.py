@@ -8,14 +8,12 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 from PIL import Image
-from scipy.interpolate import interp1d
 
-from ..color import daylight, into_gamut, on_screen, spectrum_to_linear_sRGB
+from ..color import into_gamut, on_screen, plain_view
 from ..files import encoded_file, whole_file
 from ..outputs import MARK, METADATA
 from ..settings import VISIBLE, Settings
 from ..surface.heightfield import HeightField
-from .far_field import Array
 from .result import Design
 
 if TYPE_CHECKING:
@@ -24,7 +22,6 @@ if TYPE_CHECKING:
 SUFFIXES = (".gsf", ".tif", ".toml", ".png")
 _IMAGE_DESCRIPTION = 270  # tag of TIFF
 _RECIPE_TOLERANCE = 0.01  # of the recipe; finer tables take minutes, for differences that no picture shows
-_COLOUR_WAVELENGTHS = 41
 _PLOTTED_WAVELENGTHS = np.arange(400.0, 701.0, 10.0)  # nm
 
 
@@ -95,10 +92,11 @@ def save_picture(design: Design, path: str | os.PathLike[str]) -> None:
     FigureCanvasAgg(figure)
     panels = figure.subplots(1, 4, width_ratios=(1, 1, 1.15, 1.1))
     edge = float(design.plate.edges(1)[1])
-    exposure = 1 / np.quantile(_linear_sRGB(design, design.wanted).max(axis=-1), 0.995)
-    for axes, name, light in ((panels[0], "target", design.wanted), (panels[1], "predicted", design.predicted)):
-        shown = on_screen(exposure * _linear_sRGB(design, light))
-        axes.imshow(shown, extent=(-edge, edge, -edge, edge), origin="lower")
+    difference = design.colour_difference
+    title = "predicted" if np.isnan(difference) else f"predicted, ΔE00 {difference:.1f}"
+    right = -edge if design.plate.mirrored else edge
+    for axes, name, light in zip(panels[:2], ("target", title), design.seen, strict=True):
+        axes.imshow(on_screen(into_gamut(light), plain_view), extent=(-right, right, -edge, edge), origin="lower")
         axes.set(title=name, xlabel="$x$ of $\\omega_o$", ylabel="$y$ of $\\omega_o$")
     field = design.height_field
     image = panels[2].imshow(field.heights, extent=(0, field.tile_size[0], 0, field.tile_size[1]), origin="lower")
@@ -107,17 +105,6 @@ def save_picture(design: Design, path: str | os.PathLike[str]) -> None:
     _plot_efficiency(panels[3], design)
     with whole_file(path) as temporary:
         figure.savefig(temporary, metadata=METADATA)
-
-
-def _linear_sRGB(design: Design, light: Array) -> Array:
-    """Return linear sRGB, (bins, bins, 3), of light in the bins, (w, bins, bins), under daylight; grey for a laser."""
-    own = design.wavelengths
-    if len(own) == 1:
-        return np.repeat(light[0][..., None], 3, axis=-1)
-    shown = np.linspace(own.min(), own.max(), _COLOUR_WAVELENGTHS)
-    spectra = interp1d(own, light, axis=0)(shown) * daylight(shown)[:, None, None]
-    white = spectrum_to_linear_sRGB(daylight(shown), shown)
-    return into_gamut(spectrum_to_linear_sRGB(np.moveaxis(spectra, 0, -1), shown) / white)
 
 
 def _plot_efficiency(axes: Axes, design: Design) -> None:

@@ -32,6 +32,8 @@ class Plate:
     int_ior: float | None
     levels: int | None
     tool_blur: float
+    seen_on: str = "wall"
+    unused: str = "outside"
 
     def __post_init__(self) -> None:
         for name, zero in (("texel", False), ("height_range", False), ("tool_blur", True)):
@@ -59,6 +61,9 @@ class Plate:
                 f"height_range: got {self.height_range:g} µm, a path difference of {self.path:.3g} wavelengths; wanted "
                 f"at most {deepest:.3g} µm, {_MAX_PATH:g} wavelengths"
             )
+        for name, known in (("seen_on", ("wall", "screen")), ("unused", ("outside", "mirror"))):
+            if getattr(self, name) not in known:
+                raise RequestError(f"{name}: got {getattr(self, name)!r}, wanted {' or '.join(known)}")
         longest = float(self.wavelengths.max()) * 1e-3
         sine = math.sin(math.radians(self.angle))
         if self.texel <= longest / 2:
@@ -81,6 +86,15 @@ class Plate:
     def period(self) -> float:
         """T in µm."""
         return self.texel * self.texels
+
+    @property
+    def mirrored(self) -> bool:
+        """Whether the right of the picture, as it is seen, is −x of ω_o.
+
+        An eye that looks the way the light goes, onto a wall, has −x of reflected light at its right, and +x of light
+        that a sheet transmits; one that looks towards the plate, at a screen, has the opposite.
+        """
+        return (self.seen_on == "wall") == (self.int_ior is None)
 
     @property
     def coherence_length(self) -> float:

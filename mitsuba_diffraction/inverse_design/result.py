@@ -9,14 +9,17 @@ from dataclasses import dataclass, field
 import numpy as np
 from numpy.typing import NDArray
 
+from ..color import delta_E, lamp_to_linear_sRGB, linear_sRGB_to_XYZ
 from ..geometry import diffracted
 from ..scalar_theory import scalar_error, tile_powers, transmitted_orders
+from ..settings import lobe_width
 from ..surface.heightfield import HeightField
 from .far_field import Array, lobes_in_bins
 from .plate import Plate
 
 _PIXEL = 1 / 4  # of the shortest wavelength, at most: resolves all frequencies that light reaches
 _BRIGHT = 0.1  # of the maximum of a target: what is brighter is in the target
+_LOBE = 3.0  # standard deviations, of order 0
 # Of its making: factors of the heights and of the tool's blur.
 _ERRORS = {"depth −5 %": (0.95, 1.0), "depth +5 %": (1.05, 1.0), "blur −20 %": (1.0, 0.8), "blur +20 %": (1.0, 1.2)}
 
@@ -28,7 +31,8 @@ class Design:
     Attributes:
         height_field: one period; rows ↔ +y, as in all height fields.
         plate: the request.
-        wanted, predicted: fraction of the light in each bin, (w, bins, bins), rows ↔ +y; `wanted` sums to one.
+        wanted, predicted: fraction of the light in each bin, (w, bins, bins), rows ↔ +y; `wanted` sums to one at
+            most. As the plate has them; `Plate.mirrored` says how they are seen.
         mirror: fraction in order 0, the mirror direction, (w,).
         changed: efficiency after an error of making, (w,), by its name: "depth +5 %", "blur −20 %", …
         interrupted: whether the search was interrupted.
@@ -70,27 +74,59 @@ class Design:
 
     @property
     def light(self) -> float:
-        """The mean of `efficiency`."""
-        return float(self.efficiency.mean())
+        """The fraction in the target of the light that it can use, over all wavelengths."""
+        usable = self.wanted.sum(axis=(1, 2))
+        return float(np.minimum(self.efficiency, usable).sum() / usable.sum())
 
     @property
     def contrast(self) -> float:
         """The mean of (L − L₀)/(L + L₀), L and L₀ the mean radiances in the target and beside it in the frame."""
         pairs = zip(self.predicted, self.inside, strict=True)
-        radiances = [(p[i].mean(), p[~i].mean() if not i.all() else 0.0) for p, i in pairs]
+        judged = self._judged
+        radiances = [(p[i & judged].mean(), np.mean(p[~i & judged]) if (~i & judged).any() else 0.0) for p, i in pairs]
         return float(np.mean([(bright - dark) / (bright + dark) for bright, dark in radiances]))
 
     @property
     def correlation(self) -> Array:
         """Pearson's correlation of wanted and predicted light over the bins, (w,)."""
-        pairs = zip(self.wanted, self.predicted, strict=True)
-        return np.array([np.corrcoef(t.ravel(), p.ravel())[0, 1] for t, p in pairs])
+        pairs, judged = zip(self.wanted, self.predicted, strict=True), self._judged
+        return np.array([np.corrcoef(t[judged], p[judged])[0, 1] for t, p in pairs])
+
+    @property
+    def _judged(self) -> NDArray[np.bool_]:
+        """The bins of the frame without those of order 0, if the plate sends unused light there, (bins, bins)."""
+        edges = self.plate.edges(self.wanted.shape[1])
+        middles = (edges[1:] + edges[:-1]) / 2
+        lobe = _LOBE * float(self.wavelengths.max()) * 1e-3 * lobe_width(self.plate.coherence_length)
+        return np.hypot(*np.meshgrid(middles, middles)) > (lobe if self.plate.unused == "mirror" else -1.0)
 
     @property
     def unevenness(self) -> Array:
         """The standard deviation of predicted by wanted light over the target, relative to its mean, (w,)."""
         ratios = [p[i] / t[i] for p, t, i in zip(self.predicted, self.wanted, self.inside, strict=True)]
         return np.array([ratio.std() / ratio.mean() for ratio in ratios])
+
+    def colours(self, light: Array) -> Array:
+        """Return linear sRGB, (bins, bins, 3), of light in the bins, (w, bins, bins); the brightest channel of the
+        target is 1. Grey for a laser.
+        """
+        matrix = lamp_to_linear_sRGB(self.wavelengths)
+        return np.moveaxis(light, 0, -1) @ matrix / (np.moveaxis(self.wanted, 0, -1) @ matrix).max()
+
+    @property
+    def seen(self) -> tuple[Array, Array]:
+        """Linear sRGB of target and prediction, equally bright, as they are seen, rows from the bottom."""
+        target, predicted = (self.colours(light) for light in (self.wanted, self.predicted))
+        bright, found = (linear_sRGB_to_XYZ(colours)[self._judged, 1].sum() for colours in (target, predicted))
+        columns = slice(None, None, -1 if self.plate.mirrored else 1)
+        return target[:, columns], predicted[:, columns] * bright / found
+
+    @property
+    def colour_difference(self) -> float:
+        """The mean CIEDE2000 of target and prediction, equally bright, over the frame; NaN for a laser."""
+        if np.ptp(self.wavelengths) < 2:
+            return math.nan
+        return float(delta_E(*map(linear_sRGB_to_XYZ, self.seen))[self._judged].mean())
 
     @property
     def warning(self) -> str:

@@ -7,14 +7,14 @@ import pytest
 
 import mitsuba_diffraction as md
 from mitsuba_diffraction.inverse_design import Design, Verdict
-from mitsuba_diffraction.inverse_design.build import wanted_fractions
 from mitsuba_diffraction.inverse_design.far_field import nearest_levels
 from mitsuba_diffraction.inverse_design.output import save
 from mitsuba_diffraction.inverse_design.plate import Plate
+from mitsuba_diffraction.inverse_design.target import wanted_fractions
 from mitsuba_diffraction.inverse_design.verdict import GOOD, VISIBLE
 from mitsuba_diffraction.recipe import Recipe
 
-SMALL = {"texel": 1.0, "texels": 16, "starts": 6}
+SMALL = {"texel": 1.0, "texels": 16, "starts": 6, "seen_on": "screen"}
 
 
 def lopsided(size=24):
@@ -102,6 +102,37 @@ def test_the_bsdf_sends_light_where_the_design_says(request_, llvm):
     }
     assert correlations.pop("") > 0.9
     assert max(correlations.values()) < 0.6
+
+
+@pytest.mark.parametrize("seen_on", ["wall", "screen"])
+@pytest.mark.parametrize("int_ior", [None, 1.5])
+def test_an_f_is_an_f_where_it_is_seen(seen_on, int_ior):
+    """The eye is on the side of the plate and looks the way the light goes, or behind a screen and looks back."""
+    f = np.zeros((24, 24))
+    f[3:21, 6:9] = f[3:6, 6:18] = f[10:13, 6:15] = 1
+    found = md.design(
+        f, wavelengths=532, texel=1.0, texels=16, starts=2, int_ior=int_ior, height_range=1.6, seen_on=seen_on
+    )
+    spectrum = md.precompute(found.height_field, coherence_length=8, wavelengths=(520, 560), tolerance=0.02)
+    kappa = float(found.plate.kappa[0])
+
+    def density(x, y):
+        # Where the relief itself sends the light; S(q; −κ) = S(−q; κ).
+        return spectrum.evaluate(-np.sign(kappa) * np.stack([x, y], -1) / 0.532, np.full(x.shape, abs(kappa)))
+
+    light = powers(found, density)  # columns ↔ +x of ω_o, rows ↔ +y
+    outwards = np.array([0, 0, 1.0 if int_ior is None else -1.0])
+    forward = outwards if seen_on == "wall" else -outwards
+    right = np.cross(forward, [0, 1, 0])  # of an eye whose up is +y
+    seen = light[::-1, :: int(right[0])]
+    size = len(seen)
+    expected = np.repeat(np.repeat(f, size, 0), size, 1).reshape(size, 24, size, 24).mean(axis=(1, 3))
+    correlations = [np.corrcoef(image.ravel(), expected.ravel())[0, 1] for image in (seen, seen[:, ::-1], seen[::-1])]
+    assert correlations[0] > 0.8
+    assert max(correlations[1:]) < correlations[0] - 0.2
+    target, predicted = found.seen
+    for panel in (target, predicted):
+        assert np.corrcoef(panel[::-1].mean(axis=-1).ravel(), expected.ravel())[0, 1] > 0.8
 
 
 def test_a_design_depends_on_its_seed_alone(laser):
@@ -249,15 +280,16 @@ CENTRE[31:34, 31:34] = 1
 @pytest.mark.parametrize(
     ("target", "options", "message"),
     [
-        (np.zeros((8, 8)), {}, "target: got black at 430 nm, wanted light somewhere"),
+        (np.zeros((8, 8)), {}, "target: got black everywhere, wanted light somewhere"),
         (np.zeros((0, 8)), {}, r"target: got shape \(0, 8\), wanted"),
         (np.ones(8), {}, r"target: got shape \(8,\), wanted \(rows, columns\)"),
         (np.full((8, 8), np.nan), {}, "target: got 64 values that are negative or not finite"),
         (-np.eye(8), {}, "target: got 8 values that are negative"),
         (np.ones((8, 8, 4)), {}, r"target: got shape \(8, 8, 4\), with alpha"),
         ("heart.png", {}, "target: got str, wanted an array of numbers"),
-        (np.eye(8)[..., None] * [0, 0, 1], {}, "target: got black at 540"),
-        (CENTRE, {}, "target: at 430 nm it is the mirror direction only"),
+        (CENTRE, {}, "target: it is the mirror direction only"),
+        (np.eye(8), {"seen_on": "floor"}, "seen_on: got 'floor', wanted wall or screen"),
+        (np.eye(8), {"unused": "nowhere"}, "unused: got 'nowhere', wanted outside or mirror"),
         (np.eye(8), {"texel": 0.3}, "texel: got 0.3 µm, wanted more than half the wavelength, 0.335 µm"),
         (np.eye(8), {"texel": 3}, "texel: got 3 µm with an angle of 17.5°, wanted less than 2.23 µm"),
         (np.eye(8), {"texels": 5}, "texels: got 5 of 0.8 µm, wanted a period of at least 4.46 µm"),

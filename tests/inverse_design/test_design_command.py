@@ -58,6 +58,28 @@ def test_a_target_is_a_picture_as_seen_on_a_screen():
     assert np.array_equal(read_target(Path("opaque.png")), found)
 
 
+def test_transparent_parts_are_dark_and_a_black_logo_is_inverted():
+    found = read_target(Path("flag.png"))
+    with Image.open("alpha.png") as picture:
+        alpha = np.asarray(picture, float)[..., 3] / 255
+    assert read_target(Path("alpha.png")) == pytest.approx(found * alpha)
+    logo = np.zeros((24, 24, 4), np.uint8)
+    logo[5:9, 3:20, 3] = 255  # black ink on a transparent ground
+    Image.fromarray(logo).save("logo.png")
+    assert read_target(Path("logo.png")).max() == 0
+    assert np.array_equal(read_target(Path("logo.png"), invert=True), logo[..., 3] > 0)
+
+
+def test_a_negative_is_cast_and_dark_on_light_is_named(command):
+    paper = 255 - np.asarray(Image.open("flag.png"))
+    Image.fromarray(paper).save("paper.png")
+    negative = read_target(Path("paper.png"), invert=True)
+    assert negative == pytest.approx(read_target(Path("flag.png")), abs=1e-12)
+    code, _, error = command(f"design paper.png {OPTIONS}")
+    assert code == 0
+    assert "note: paper.png is light up to its edges; --invert casts what is dark in it, with more contrast" in error
+
+
 def test_a_target_is_upright_as_its_exif_data_say():
     exif = Image.Exif()
     exif[0x0112] = 6  # its first row is shown on the right
@@ -104,8 +126,8 @@ def test_an_interrupted_command_writes_the_best_so_far(command, monkeypatch):
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
-        ("black.png", "target: got black at 430 nm, wanted light somewhere"),
-        ("alpha.png", "alpha.png: got a picture with alpha, wanted an opaque one"),
+        ("black.png", "black.png: got black alone, wanted light somewhere; --invert casts what is dark"),
+        ("flag.png --seen-on floor", "seen_on: got 'floor', wanted wall or screen"),
         ("text.png", "text.png: not a picture that can be read"),
         ("cut.png", "cut.png: not a picture that can be read"),
         ("gone.png", "gone.png: no such file"),

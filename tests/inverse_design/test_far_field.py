@@ -7,9 +7,10 @@ import pytest
 import scipy.integrate
 import scipy.ndimage
 
-from mitsuba_diffraction.inverse_design.build import far_field_of, wanted_fractions
+from mitsuba_diffraction.inverse_design.build import far_field_of
 from mitsuba_diffraction.inverse_design.far_field import blurred_texels, lobes_in_bins, nearest_levels
 from mitsuba_diffraction.inverse_design.plate import Plate
+from mitsuba_diffraction.inverse_design.target import wanted_fractions, with_unused
 from mitsuba_diffraction.reference import order_powers
 from mitsuba_diffraction.settings import lobe_width
 from mitsuba_diffraction.surface.heightfield import HeightField
@@ -82,18 +83,39 @@ def test_targets_have_their_top_at_positive_y_and_their_right_at_positive_x():
     wanted = wanted_fractions(picture, plate())[0]
     y, x = np.meshgrid(*2 * [(np.arange(len(wanted)) + 0.5) / len(wanted) * 2 - 1], indexing="ij")
     assert wanted.sum() == pytest.approx(1)
-    assert (wanted * x).sum() == pytest.approx(0.75, abs=0.01)
+    assert (wanted * x).sum() == pytest.approx(0.75 * 20 / 30, abs=0.01)  # its proportions are kept
     assert (wanted * y).sum() == pytest.approx(2 / 3, abs=0.01)
+    wide = wanted_fractions(picture.T, plate())[0]
+    assert wide[:3].sum() == wide[-3:].sum() == 0
 
 
-def test_colours_of_a_target_belong_to_wavelengths():
+def test_grey_pictures_want_all_light_and_colours_what_they_can_use():
+    white = np.array([430.0, 500, 540, 650])
+    grey = np.random.default_rng(0).random((8, 8))
+    wanted = wanted_fractions(grey, plate(wavelengths=white))
+    assert wanted.sum(axis=(1, 2)) == pytest.approx(1)
+    assert wanted_fractions(np.dstack([grey] * 3), plate(wavelengths=white)) == pytest.approx(wanted)
     picture = np.zeros((8, 8, 3))
     picture[:, :4, 0] = 1  # red on the left
     picture[:, 4:, 2] = 1  # blue on the right
-    picture[:4, :, 1] = 1  # green above
-    blue, turquoise, green, red = wanted_fractions(picture, plate(wavelengths=np.array([430.0, 500, 540, 650])))
-    half = len(blue) // 2
-    assert blue[:, :half].sum() == pytest.approx(0, abs=1e-12)
-    assert red[:, half + 1 :].sum() == pytest.approx(0, abs=1e-12)
-    assert green[:half].sum() == pytest.approx(0, abs=1e-12)
-    assert turquoise == pytest.approx((blue + green) / 2)
+    coloured = wanted_fractions(picture, plate(wavelengths=white))
+    half = coloured.shape[1] // 2
+    left, right = (side.sum(axis=(1, 2)) for side in (coloured[..., :half], coloured[..., half + 1 :]))
+    assert right[0] > 20 * left[0]
+    assert left[3] > 20 * right[3]
+    assert max(left[2], right[2]) < 0.2  # green light cannot be used
+    assert coloured.sum(axis=(1, 2)).max() == pytest.approx(1)
+    turned = wanted_fractions(picture, plate(wavelengths=white[::-1]))
+    assert turned == pytest.approx(coloured[::-1], abs=1e-9)
+
+
+def test_light_that_colours_cannot_use_may_go_into_the_mirror_direction():
+    picture = np.zeros((8, 8, 3))
+    picture[:, :4, 0] = 1
+    one = plate(wavelengths=np.array([450.0, 550, 650]), unused="mirror", texels=40)
+    wanted = wanted_fractions(picture, one)
+    spare = with_unused(wanted, one) - wanted
+    assert spare.sum(axis=(1, 2)) == pytest.approx(1 - wanted.sum(axis=(1, 2)), abs=1e-3)
+    y, x = np.meshgrid(*2 * [(one.edges(spare.shape[1])[1:] + one.edges(spare.shape[1])[:-1]) / 2], indexing="ij")
+    assert spare[0][np.hypot(x, y) < 2 * one.pitch].sum() > 0.9 * spare[0].sum()
+    assert with_unused(wanted, plate()) is wanted

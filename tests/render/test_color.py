@@ -7,12 +7,16 @@ from PIL import Image
 
 from mitsuba_diffraction.color import (
     auto_exposure,
+    delta_E,
     into_gamut,
+    lamp_to_linear_sRGB,
+    linear_sRGB_to_XYZ,
     ocio_view,
     on_screen,
     roll_off,
     spectrum_to_linear_sRGB,
     spectrum_to_XYZ,
+    upsampled,
 )
 from mitsuba_diffraction.render.spectral_image import SpectralImage, save_preview
 
@@ -189,3 +193,38 @@ def test_without_OpenColorIO_a_view_is_refused_in_one_line(monkeypatch):
     monkeypatch.setitem(sys.modules, "PyOpenColorIO", None)
     with pytest.raises(ValueError, match=r"pip install 'mitsuba_diffraction\[ocio\]'"):
         ocio_view("ACES")
+
+
+WHITE = 1e3 / np.linspace(1e3 / 430, 1e3 / 670, 8)
+
+
+def test_colours_become_spectra_of_these_colours():
+    """All but the most saturated ones, whose spectra would leave the range from 0 to 1."""
+    matrix = lamp_to_linear_sRGB(WHITE)
+    assert matrix.sum(axis=0) == pytest.approx(1)
+    encoded = np.array([[0, 80, 255], [200, 120, 40], [255, 255, 0], [90, 90, 90], [0, 0, 0]]) / 255
+    rgb = colour.cctf_decoding(encoded, function="sRGB")
+    spectra = upsampled(rgb, matrix)
+    assert spectra.min() >= 0
+    assert spectra.max() <= 1
+    assert spectra @ matrix == pytest.approx(rgb, abs=2e-4)
+    random = np.random.default_rng(0).random((7, 9, 3))
+    difference = delta_E(linear_sRGB_to_XYZ(random), linear_sRGB_to_XYZ(upsampled(random, matrix) @ matrix))
+    assert difference.max() < 2
+    assert np.median(difference) < 0.01
+
+
+def test_spectra_of_colours_are_those_of_another_implementation():
+    wavelengths = np.arange(400.0, 701.0, 10.0)
+    rgb = colour.cctf_decoding(np.array([0.7, 0.45, 0.2]), function="sRGB")
+    found = upsampled(rgb, lamp_to_linear_sRGB(wavelengths))
+    shape = colour.SpectralShape(400, 700, 10)
+    cmfs = colour.MSDS_CMFS["CIE 1931 2 Degree Standard Observer"].copy().align(shape)
+    daylight = colour.SDS_ILLUMINANTS["D65"].copy().align(shape)
+    expected = colour.recovery.XYZ_to_sd_Jakob2019(linear_sRGB_to_XYZ(rgb), cmfs, daylight).values
+    assert found == pytest.approx(expected, abs=0.02)
+
+
+def test_light_of_a_laser_is_grey():
+    assert lamp_to_linear_sRGB(np.array([532.0])) == pytest.approx(np.ones((1, 3)))
+    assert upsampled(np.full((2, 3), 0.3), np.ones((1, 3))) == pytest.approx(np.full((2, 1), 0.3), abs=1e-6)

@@ -1,0 +1,87 @@
+"""The light that a picture wants of a plate: a fraction of each wavelength in each direction."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from ..color import lamp_to_linear_sRGB, upsampled
+from ..errors import RequestError
+from .far_field import Array, lobes_in_bins
+from .plate import Plate
+
+_BINS_PER_ORDER = 1.5
+
+
+def wanted_fractions(target: ArrayLike, plate: Plate) -> Array:
+    """Return t, the wanted fraction of the light in each bin, (w, bins, bins), rows ↔ +y.
+
+    Pixels are squares: the longer edge of the picture fills the frame, and the rest of it is dark. Colours are
+    reflectances ρ(λ) of the light of a lamp (`upsampled`), t = ρ/max Σ ρ over the wavelengths: of one wavelength all
+    light is wanted in the picture, of grey pictures that of all.
+
+    Raises:
+        ValueError: if the target is not a picture, is black, or lies in the mirror direction.
+    """
+    try:
+        picture = np.asarray(target, np.float64)
+    except (TypeError, ValueError):
+        raise RequestError(f"target: got {type(target).__name__}, wanted an array of numbers") from None
+    if picture.ndim == 3 and picture.shape[2] in (2, 4):
+        raise RequestError(f"target: got shape {picture.shape}, with alpha; wanted an opaque picture, grey or RGB")
+    if picture.size == 0 or not (picture.ndim == 2 or (picture.ndim == 3 and picture.shape[2] == 3)):
+        raise RequestError(f"target: got shape {picture.shape}, wanted (rows, columns) or (rows, columns, 3)")
+    if not (np.isfinite(picture).all() and picture.min() >= 0):
+        raise RequestError(
+            f"target: got {np.count_nonzero(~(picture >= 0) | np.isinf(picture))} values that are negative or not "
+            "finite, wanted linear radiance ≥ 0"
+        )
+    if picture.max() == 0:
+        raise RequestError("target: got black everywhere, wanted light somewhere")
+    channels = picture[..., None] if picture.ndim == 2 else picture
+    count = math.ceil(_BINS_PER_ORDER * plate.orders_across)
+    binned = _in_bins(channels / channels.max(), count)
+    if binned.shape[-1] == 3 and np.ptp(binned, axis=-1).max() > 0:
+        order, matrix = np.argsort(plate.wavelengths), lamp_to_linear_sRGB(plate.wavelengths)
+        spectra = upsampled(binned, matrix[order])[..., np.argsort(order)]
+    else:
+        spectra = np.repeat(binned[..., :1], len(plate.wavelengths), axis=-1)
+    wanted = np.moveaxis(spectra, -1, 0) / spectra.sum(axis=(0, 1)).max()
+    middles = (plate.edges(count)[1:] + plate.edges(count)[:-1]) / 2
+    near = np.hypot(*np.meshgrid(middles, middles)) < plate.pitch
+    if wanted[:, ~near].sum() < 1e-9 * wanted.sum():
+        raise RequestError(
+            f"target: it is the mirror direction only (within {plate.pitch:.2g} of it), into which a flat plate sends "
+            "all light; wanted light elsewhere, too"
+        )
+    return wanted
+
+
+def with_unused(wanted: Array, plate: Plate) -> Array:
+    """Return t with the light that the colours leave unused in the lobe of order 0, if the plate wants it there."""
+    if plate.unused != "mirror":
+        return wanted
+    edges, aim = plate.edges(wanted.shape[1]), wanted.copy()
+    for one, wavelength in zip(aim, plate.wavelengths, strict=True):
+        lobe = lobes_in_bins(edges, [0], plate.period, wavelength * 1e-3, plate.coherence_length)[:, 0]
+        one += (1 - one.sum()) * np.outer(lobe, lobe)
+    return aim
+
+
+def _in_bins(channels: Array, count: int) -> Array:
+    """Return a picture, rows from the top, in square bins, rows from the bottom: (count, count, channels)."""
+    size = max(channels.shape[:2])
+    rows, columns = (_overlaps(n, size, count) for n in channels.shape[:2])
+    return np.einsum("ir,rcs,jc->ijs", rows, channels[::-1], columns) * (count / size) ** 2
+
+
+def _overlaps(pixels: int, length: int, bins: int) -> Array:
+    """Return the length of each pixel in each of the bins, (bins, pixels), in pixels.
+
+    The bins are `length` long in all, and the pixels in the middle of them.
+    """
+    edges = np.linspace(0, length, bins + 1) - (length - pixels) / 2
+    below = np.clip(edges[:, None] - np.arange(pixels), 0, 1)
+    return np.diff(below, axis=0)
