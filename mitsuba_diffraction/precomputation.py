@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import warnings
 from collections.abc import Sequence
 
 import numpy as np
@@ -85,7 +86,10 @@ def precompute(
     patches = (height_field,) if isinstance(height_field, HeightField) else tuple(height_field)
     if not all(isinstance(patch, HeightField) for patch in patches):
         raise RequestError(f"height_field: got {type(height_field).__name__}, wanted a HeightField or several")
-    return build_spectrum(patches, settings, progress)
+    spectrum = build_spectrum(patches, settings, progress)
+    if isinstance(spectrum, GratingSpectrum) and spectrum.excess:
+        warnings.warn(spectrum.excess, stacklevel=2)
+    return spectrum
 
 
 def build_spectrum(patches: Sequence[HeightField], settings: Settings, progress: Progress = silent) -> Spectrum:

@@ -28,6 +28,9 @@ REPRESENTATIONS = ("auto", "slices", *SERIES)
 ORIGINS = ("mean", "lowest")
 MAX_TERMS = 999
 MIN_TOLERANCE, MIN_RIGOROUS_TOLERANCE = 1e-5, 1e-4
+# Default tolerances: of separate orders, and of surfaces whose spectrum scatters or whose orders overlap.
+ORDERS_TOLERANCE, CONTINUUM_TOLERANCE = 1e-3, 1e-2
+TAIL_FRACTION = 0.4  # of the tolerance, for the truncated tails of the lobes
 
 # Light that enters a dielectric is absorbed, stays in it, or is transmitted by a plane below.
 TRANSMISSIONS = ("none", "interface", "sheet")
@@ -48,7 +51,8 @@ class Settings:
             (Stam 1999) or "chebyshev" (Dhillon and Ghosh 2016).
         tolerance: bound of max over κ of ∫|S_approx(q; κ) − S_exact(q; κ)| dq, a fraction of the reflected power; by
             default 1e-2, and 1e-3 for one tile whose orders do not overlap. In rigorous theory, the bound of
-            `RigorousSpectrum.error`, by default 1e-2.
+            `RigorousSpectrum.error`, by default 1e-2. With `terms` it may be one or more, for a picture of a series
+            that is known to be wrong.
         largest_height_range: in µm; deeper surfaces are refused, since their heights may be in nm. Time and memory grow
             with the height range.
         terms: N of a series, whatever its error; None, in files "auto", is the number that the tolerance requires.
@@ -96,7 +100,11 @@ class Settings:
         for name, valid, wanted in (
             ("coherence_length", lambda x: lobe_width(x) > 0, "a number"),
             ("largest_angle", lambda x: 0 < x <= 90, "degrees from the normal, above 0, at most 90"),
-            ("tolerance", lambda x: min_tolerance <= x < 1, f"a fraction of the light, from {min_tolerance:g} to 1"),
+            (
+                "tolerance",
+                lambda x: min_tolerance <= x < (math.inf if isinstance(self.terms, int) else 1),
+                f"a fraction of the light, from {min_tolerance:g} to 1",
+            ),
             ("largest_height_range", lambda x: x > 0, "a positive number of µm"),
             ("ext_ior", lambda x: 1 <= x <= 10, "the index of the medium above, from 1 to 10"),
         ):
@@ -159,6 +167,15 @@ class Settings:
             )
         if self.terms is not None:
             check_whole("terms", self.terms, 1, MAX_TERMS)
+
+    @property
+    def lobe_cutoff(self) -> float:
+        """Half the side of the square to which a lobe is truncated, in σ_q, for the part of the tolerance that it has.
+
+        The default stands for tolerances from one on.
+        """
+        assert self.tolerance is not None
+        return lobe_cutoff(TAIL_FRACTION * (self.tolerance if self.tolerance < 1 else CONTINUUM_TOLERANCE))
 
     @property
     def chosen(self) -> dict[str, Any]:

@@ -36,7 +36,10 @@ PARAMETERS = (
         "chebyshev",
     ),
     Parameter(
-        "terms", "integer or string", "number of terms of a series, or auto (default): as many as the tolerance needs"
+        "terms",
+        "integer or string",
+        "number of terms of a series, or auto (default): as many as the tolerance needs. An error above the tolerance "
+        "is logged, and one of all light or more is refused, unless tolerance, then also above 1, allows it",
     ),
     Parameter("heights_from", "string", "for a series, the level of h = 0: mean (default) or lowest"),
     Parameter(

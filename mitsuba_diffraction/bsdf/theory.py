@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import contextlib
 import functools
 import logging
+from collections.abc import Iterator
 from typing import Protocol, cast
 
 import drjit as dr
@@ -33,10 +35,41 @@ MAX_FILM_CHANGE = 5e-4  # µm, of a film, up to which a table is reused
 _log = logging.getLogger(__name__)
 
 
+_MAX_ERROR = 1.0  # of a spectrum, a fraction of the light: that of a black one
+_shows_errors = False
+
+
+@contextlib.contextmanager
+def errors_shown() -> Iterator[None]:
+    """Take spectra of any error, without a warning, inside a `with` block: for pictures that show what terms do."""
+    global _shows_errors
+    before, _shows_errors = _shows_errors, True
+    try:
+        yield
+    finally:
+        _shows_errors = before
+
+
 @functools.cache
-def _warn_of_range(source: str, warning: str) -> None:
+def _warn(source: str, warning: str) -> None:
     """Log a warning, once for each surface."""
     _log.warning("diffraction_grating, %s: %s", source, warning)
+
+
+def _check_error(spectrum: GratingSpectrum) -> None:
+    """Log the error of a series that has too few terms for its tolerance.
+
+    Raises:
+        RequestError: if it is as wrong as no light at all.
+    """
+    if not spectrum.excess or _shows_errors:
+        return
+    if spectrum.error >= _MAX_ERROR:
+        raise RequestError(
+            f"{spectrum.excess}; wanted more terms or terms=auto, heights_from=mean, chebyshev or slices; a tolerance "
+            "above the error accepts it"
+        )
+    _warn(spectrum.source, spectrum.excess)
 
 
 class Scattering(Protocol):
@@ -156,6 +189,7 @@ class ScalarTheory(Theory):
     """
 
     def __init__(self, spectrum: GratingSpectrum, request: GratingRequest) -> None:
+        _check_error(spectrum)
         self.spectrum, self.media, self.scales = spectrum, request.media, request.scales
         self.material, self.shadowing = request.material, request.shadowing
         self.conserve_energy = request.conserve_energy
@@ -200,7 +234,7 @@ class ScalarTheory(Theory):
             outside = index if self.media.eta is None else self.media.outside
             if warning := self.spectrum.waves.error(light, outside).warning:
                 of_glass = "" if self.material.transparent else "; this is the error of glass, that of metals differs"
-                _warn_of_range(self.spectrum.source, warning + of_glass)
+                _warn(self.spectrum.source, warning + of_glass)
 
     def _films_changed(self) -> bool:
         """Return whether films differ from those of the tables by more than `MAX_FILM_CHANGE`."""

@@ -92,8 +92,9 @@ def _precompute(source: Path, recipe: Recipe, target: Path, seam: str) -> None:
         f"{target}: {spectrum.source}; {spectrum.extent}, {spectrum.grid}; coherence length "
         f"{spectrum.coherence_length:.4g} µm; {_table_summary(spectrum)}{seam}"
     )
-    if isinstance(spectrum, GratingSpectrum) and spectrum.warning:
-        tell(f"! {spectrum.warning}")
+    for text in (spectrum.excess, spectrum.warning) if isinstance(spectrum, GratingSpectrum) else ():
+        if text:
+            tell(f"! {text}")
 
 
 def _table_summary(spectrum: Spectrum) -> str:

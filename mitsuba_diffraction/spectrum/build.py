@@ -14,10 +14,10 @@ from numpy.typing import NDArray
 
 from ..errors import RequestError
 from ..progress import Progress, part, stage
-from ..settings import SERIES, Settings, lobe_cutoff, lobe_width
+from ..settings import CONTINUUM_TOLERANCE, ORDERS_TOLERANCE, SERIES, Settings, lobe_width
 from ..surface.heightfield import HeightField
 from .grids import LobeAxis, OrderGrid, inner
-from .power_spectrum import TAIL_FRACTION, PowerSpectrum
+from .power_spectrum import PowerSpectrum
 from .sample import SamplePowers, effective_coherence_length, standard_error
 from .tables import (
     AmplitudeTable,
@@ -43,8 +43,6 @@ _MAX_TRANSFORMS, _MIN_MEASURED = 400, 8
 _MEASURED_FRACTION = 0.95  # of the largest error over κ that the largest of those measured is at least
 _MAX_UNPACKED_NODES = 2_000  # up to which the nodes of one κ fit unpacked into the first-level cache
 _MAX_TABLE_BYTES = 4e9
-# Default tolerances: of separate orders, and of surfaces whose spectrum scatters or whose orders overlap.
-_ORDERS_TOLERANCE, _CONTINUUM_TOLERANCE = 1e-3, 1e-2
 
 Splines = SamplePowers | TileSplines
 
@@ -65,14 +63,14 @@ def build_spectrum(patches: Sequence[HeightField], settings: Settings, progress:
         sigma = lobe_width(effective)
         if tolerance is None:
             tolerance = _default_tolerance(height_field, len(patches), sigma)
-        rho = lobe_cutoff(TAIL_FRACTION * tolerance)
+        rho = dataclasses.replace(settings, tolerance=tolerance).lobe_cutoff
         orders = TilePowers(patches, max_frequency, rho * sigma)
         lobes = orders.grid.lobes(sigma, rho)
         powers = None if series else _tile_splines(orders, lobes, sigma, max_frequency, tolerance)
         if powers is None:
             powers, tail = orders, 2 * (1 - lobes[0].inside * lobes[1].inside)
     else:
-        tolerance = _CONTINUUM_TOLERANCE if tolerance is None else tolerance
+        tolerance = CONTINUUM_TOLERANCE if tolerance is None else tolerance
         effective = effective_coherence_length(height_field, coherence_length)
         with stage("standard error"):
             progress(1, 100)
@@ -123,12 +121,12 @@ def build_spectrum(patches: Sequence[HeightField], settings: Settings, progress:
 
 def _default_tolerance(height_field: HeightField, patches: int, sigma: float) -> float:
     """Return the default tolerance of a tile, from whether its orders, of width σ_q, overlap."""
-    half_width = lobe_cutoff(TAIL_FRACTION * _CONTINUUM_TOLERANCE) * sigma
+    half_width = Settings(tolerance=CONTINUUM_TOLERANCE).lobe_cutoff * sigma
     overlap = any(
         count > 1 and 1 / size < 2 * half_width
         for size, count in zip(height_field.tile_size, height_field.shape[::-1], strict=True)
     )
-    return _CONTINUUM_TOLERANCE if overlap or patches > 1 else _ORDERS_TOLERANCE
+    return CONTINUUM_TOLERANCE if overlap or patches > 1 else ORDERS_TOLERANCE
 
 
 def _spline_spacing(tolerance: float, sigma: float) -> float:
@@ -288,16 +286,12 @@ class _Build:
         self.unresolved_power = max(1 - self._exact.reached(self._exact(kappa)) for kappa in kappas)
         with np.errstate(over="ignore", invalid="ignore"):
             error = self._measured(table, kappas)
-        found = (
-            f"{kind}: {count} terms of heights from the {origin}, of a range of {self._range:.3g} µm, err by "
-            f"{error:.2g} of the power, more than the tolerance {self._allowed:.2g}"
-        )
         if not np.isfinite(error) or (error > self._allowed and settings.terms is None):
             raise RequestError(
-                f"{found}: in float32 they grow to e^{x:.1f} and cancel; wanted 'chebyshev', or 'slices'"
+                f"{kind}: {count} terms of heights from the {origin}, of a range of {self._range:.3g} µm, err by "
+                f"{error:.2g} of the power, more than the tolerance {self._allowed:.2g}: in float32 they grow to "
+                f"e^{x:.1f} and cancel; wanted 'chebyshev', or 'slices'"
             )
-        if error > self._allowed:
-            warnings.warn(found, stacklevel=5)
         return table, error
 
     def _measured(self, table: SliceTable | AmplitudeTable, kappas: NDArray[np.float64]) -> float:

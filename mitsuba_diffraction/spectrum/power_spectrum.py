@@ -11,11 +11,9 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from ..errors import RequestError, check_whole
-from ..settings import Settings, lobe_cutoff, lobe_width, matching
+from ..settings import Settings, lobe_width, matching
 from .grids import LobeAxis, OrderGrid, SplineGrid
 from .tables import AmplitudeTable, SliceTable
-
-TAIL_FRACTION = 0.4  # of the tolerance, for the truncated tails of the lobes
 
 
 @dataclass(frozen=True, eq=False)
@@ -99,6 +97,17 @@ class PowerSpectrum:
         return cast(float, self.settings.tolerance)
 
     @property
+    def excess(self) -> str:
+        """A sentence on the error of a series that has too few terms for its tolerance; else empty."""
+        if self.settings.terms is None or self.error <= self.tolerance:
+            return ""
+        return (
+            f"{self.representation}: {self.settings.terms} terms of heights from the {self.settings.heights_from}, of "
+            f"a range of {self.height_range:.3g} µm, err by {self.error:.2g} of the power, more than the tolerance "
+            f"{self.tolerance:.2g}"
+        )
+
+    @property
     def representation(self) -> str:
         """The storage of the powers: "slices", "taylor" or "chebyshev"."""
         return self.settings.representation
@@ -116,7 +125,7 @@ class PowerSpectrum:
     @property
     def cutoff_sigmas(self) -> float:
         """The smallest half width of a truncated lobe, in standard deviations σ_q."""
-        return lobe_cutoff(TAIL_FRACTION * self.tolerance)
+        return self.settings.lobe_cutoff
 
     @property
     def lobes(self) -> tuple[LobeAxis, LobeAxis]:

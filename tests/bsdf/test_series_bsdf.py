@@ -2,6 +2,7 @@
 
 import dataclasses
 import functools
+import weakref
 
 import drjit as dr
 import mitsuba as mi
@@ -11,6 +12,7 @@ from bsdf_support import check_chi_square, direction, interaction, plugin, vecto
 from test_bsdf import evaluate, expected, raw_plugin, towards
 
 import mitsuba_diffraction as md
+from mitsuba_diffraction.bsdf import theory
 
 pytestmark = pytest.mark.usefixtures("llvm")
 EACH = pytest.mark.parametrize("kind", ["taylor", "chebyshev"])
@@ -104,8 +106,7 @@ def test_the_derivative_by_height_is_that_of_differences(kind, coherence_length,
 
 
 def test_scenes_and_recipes_take_a_series(tmp_path):
-    with pytest.warns(UserWarning, match="taylor: 20 terms of heights from the lowest"):
-        found = mi.load_dict({**BLAZE, "representation": "taylor", "terms": 20, "heights_from": "lowest"}).spectrum
+    found = mi.load_dict({**BLAZE, "representation": "taylor", "terms": 20, "heights_from": "lowest"}).spectrum
     settings = found.settings
     assert (settings.representation, settings.terms, settings.heights_from) == ("taylor", 20, "lowest")
     recipe = tmp_path / "blaze.toml"
@@ -116,6 +117,55 @@ def test_scenes_and_recipes_take_a_series(tmp_path):
     assert mi.load_dict(scene).spectrum.representation == "taylor"
     assert mi.load_dict({**scene, "representation": "chebyshev"}).spectrum.representation == "chebyshev"
     assert mi.load_dict({**scene, "representation": "slices"}).spectrum.representation == "slices"
+
+
+FEW = {**BLAZE, "representation": "taylor", "terms": 20, "heights_from": "lowest"}  # errs by 0.44 at 360 nm
+WRONG = {**FEW, "profile": "sinusoidal", "depth": 0.5, "terms": 8}
+
+
+@pytest.fixture
+def anew(monkeypatch):
+    """A function that forgets which spectra are in use and what was logged, as a new process does."""
+
+    def forget():
+        monkeypatch.setattr("mitsuba_diffraction.recipe._in_use", weakref.WeakValueDictionary())
+        theory._warn.cache_clear()
+
+    forget()
+    return forget
+
+
+def test_the_error_of_too_few_terms_is_logged_wherever_the_spectrum_is_from(anew, caplog, tmp_path):
+    computed = mi.load_dict(FEW).spectrum
+    computed.save(tmp_path / "few.exr")
+    anew()
+    cached = mi.load_dict(FEW).spectrum
+    assert cached is not computed
+    anew()
+    mi.load_dict({"type": "diffraction_grating", "filename": str(tmp_path / "few.exr"), "material": "Al"})
+    said = "taylor: 20 terms of heights from the lowest, of a range of 0.25 µm, err by 0.44 of the power"
+    assert caplog.text.count(said) == 3
+
+
+def test_a_spectrum_that_errs_by_all_of_the_light_is_refused_unless_its_tolerance_allows_it(anew, caplog, tmp_path):
+    refusal = r"taylor: 8 terms of heights from the lowest.* err by 1\.3e\+09 of the power.*wanted more terms"
+    for _ in range(2):  # computed, and cached
+        with pytest.raises(RuntimeError, match=refusal):
+            mi.load_dict(WRONG)
+        anew()
+    with pytest.warns(UserWarning, match="taylor: 8 terms"):
+        spectrum = md.precompute(
+            md.gratings.sinusoidal(2.5, 0.5), representation="taylor", terms=8, heights_from="lowest"
+        )
+    spectrum.save(tmp_path / "wrong.exr")
+    with pytest.raises(RuntimeError, match=refusal):
+        mi.load_dict({"type": "diffraction_grating", "filename": str(tmp_path / "wrong.exr"), "material": "Al"})
+    assert not caplog.text
+    accepted = mi.load_dict({**WRONG, "tolerance": 2e9})
+    assert accepted.spectrum.error == pytest.approx(spectrum.error, rel=1e-3)
+    assert not caplog.text
+    with pytest.raises(RuntimeError, match=r"tolerance: got 2000000000\.0, wanted a fraction"):
+        mi.load_dict({**BLAZE, "tolerance": 2e9})
 
 
 @EACH

@@ -10,7 +10,6 @@ import itertools
 import operator
 import os
 import time
-import warnings
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import AbstractContextManager
 from dataclasses import dataclass
@@ -21,6 +20,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ...bsdf.base import gratings_in
+from ...bsdf.theory import errors_shown
 from ...color import XYZ_to_linear_sRGB, delta_E, into_gamut, on_screen, spectrum_to_XYZ
 from ...errors import RequestError
 from ...grating_spectrum import GratingSpectrum
@@ -169,9 +169,8 @@ def study(
 
 
 def _loaded(path: str | os.PathLike[str], width: int | None, parameters: Mapping[str, str]) -> mi.Scene:
-    with warnings.catch_warnings():
-        # The error of a series is in the table.
-        warnings.filterwarnings("ignore", r"(taylor|chebyshev): \d+ terms", UserWarning)
+    # The error of a series is in the table.
+    with errors_shown():
         return load_spectral_scene(path, width=width, parameters=parameters)
 
 
