@@ -46,6 +46,7 @@ class Grating:
         self.recipe = surface if isinstance(surface, Recipe) else None
         self.spectrum = surface.cached(_per_cent) if isinstance(surface, Recipe) else surface
         self.theory = theory_of(props, self.spectrum, request)
+        self._check_window(self.theory.wavelengths[0])
         # Mitsuba's own object does not outlive the construction of the plugin.
         self._props, self._request = mi.Properties(props), request
         # The grating is black at angles that the spectrum does not cover.
@@ -68,8 +69,9 @@ class Grating:
         A spectrum from a recipe or a profile is computed anew where it ends before.
 
         Raises:
-            RequestError: if the material or a saved spectrum does not cover them.
+            RequestError: if the material or a saved spectrum does not cover them, or the coherence length is shorter.
         """
+        self._check_window(wavelengths[1])
         (first, last), (shortest, longest) = wavelengths, self.theory.material.wavelengths
         if first < shortest * (1 - 1e-6) or last > longest * (1 + 1e-6):
             raise RequestError(
@@ -91,6 +93,19 @@ class Grating:
             # The parameters are no longer those of the request.
             self.theory.parameters_changed([])
             self.theory.cover(wavelengths)
+
+    def _check_window(self, wavelength: float) -> None:
+        """Check that a window of the coherence length has a far field at a wavelength in air, nm.
+
+        Raises:
+            RequestError: if it is shorter than the wavelength: lobes would be wider than the hemisphere.
+        """
+        coherence_length = self.spectrum.coherence_length
+        if coherence_length < 1e-3 * wavelength * (1 - 1e-6):
+            raise RequestError(
+                f"coherence_length: got {coherence_length:.4g} µm with light of {wavelength:g} nm, wanted at least the "
+                "wavelength: a shorter window has no far field"
+            )
 
     def _range(self) -> tuple[float, float]:
         """Return the shortest and the longest wavelength that both spectrum and material cover, nm."""

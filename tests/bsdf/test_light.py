@@ -194,3 +194,28 @@ def test_the_error_of_scalar_theory_is_that_of_the_light_and_logged_once(llvm, c
     assert "this is the error of glass, that of metals differs" in infrared
     assert warnings_of((1500.0, 1600.0)) == []
     assert warnings_of((1500.0, 1600.0), coat_ior=1.5) == []  # 1000 to 1067 nm in the coat
+
+
+def flat(coherence_length):
+    return {**GRATING, "depth": 0.0, "material": "none", "coherence_length": coherence_length}
+
+
+@pytest.mark.parametrize(
+    ("coherence_length", "film", "light"), [(0.1, None, 360), (0.8, None, 830), (0.8, (400, 900), 900)]
+)
+def test_a_window_shorter_than_the_wavelength_is_refused(llvm, coherence_length, film, light):
+    # Regression: of a coherence length of 0.1 µm, a flat mirror reflected 0.05 to 0.25.
+    refusal = f"coherence_length: got {coherence_length:g} µm with light of {light} nm, wanted at least the wavelength"
+    with pytest.raises(RuntimeError, match=refusal):
+        mi.load_dict(scene(flat(coherence_length), film))
+
+
+def test_the_light_of_the_scene_decides_on_the_shortest_window(llvm):
+    assert mi.load_dict(scene(flat(0.8), (400, 780)))
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("theta", [0, 45, 75])
+def test_a_flat_mirror_with_a_window_of_one_wavelength_reflects_nearly_all_light(llvm, theta):
+    found = albedo(mi.load_dict(flat(0.7)), direction(theta, 0), wavelengths=[700.0] * 4)
+    np.testing.assert_allclose(found, 1, atol=0.17)
