@@ -69,6 +69,7 @@ _SCAN_KEYS = frozenset({"scan", "pixel_size", "height_range", "fill_missing", "c
 _SPECTRUM_KEYS = frozenset(f.name for f in fields(Settings))
 REQUESTED = "representation", "terms", "heights_from", "tolerance"  # of a spectrum; they may override a recipe's
 _OF_PROFILE = "coherence_length", "largest_height_range", *REQUESTED
+MAX_PATCHES = 1000  # after which speckle is three per cent of that of one patch
 # Incremented when the same input gives a different result, to invalidate the cache.
 _BUILD_VERSION = 10
 # Spectra in the package (precompute/ready_spectra.py), named as in the cache.
@@ -115,7 +116,7 @@ class Recipe:
             raise RequestError(f"profile: got {self.surface['profile']!r}, wanted one of {', '.join(PROFILES)}")
         if "profile" in self.surface and "patches" in self.surface:
             patches = self.surface["patches"]
-            check_whole("patches", patches, 1)
+            check_whole("patches", patches, 1, MAX_PATCHES)
             if "seed" not in inspect.signature(PROFILES[self.surface["profile"]]).parameters:
                 raise RequestError(
                     f"patches: got {patches!r} of the profile {self.surface['profile']!r}, wanted a profile with a seed"

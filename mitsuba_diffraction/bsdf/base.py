@@ -12,6 +12,9 @@ import mitsuba as mi
 import numpy as np
 
 from ..errors import RequestError, is_number
+from ..settings import VISIBLE
+
+_CHECKED = 32  # points along u and v at which a base is checked
 
 living: weakref.WeakSet[mi.BSDF] = weakref.WeakSet()  # the gratings of all scenes
 
@@ -113,6 +116,24 @@ class Base:
         self.components = [bsdf.flags(i) & ~+mi.BSDFFlags.BackSide for i in range(bsdf.component_count())]
         self.has_delta = bool(flags & +mi.BSDFFlags.DeltaReflection)
         self._is_diffuse = bool(flags & +mi.BSDFFlags.DiffuseReflection)
+        self.check()
+
+    def check(self) -> None:
+        """Check that no light is negative, at points and wavelengths spread over their ranges.
+
+        Mitsuba's textures take any number when parameters change.
+
+        Raises:
+            RequestError: if the reflectance is negative.
+        """
+        u, v = dr.meshgrid(*[dr.linspace(mi.Float, 0, 1, _CHECKED, endpoint=False)] * 2)
+        si = dr.zeros(mi.SurfaceInteraction3f, _CHECKED**2)
+        si.uv, si.wi, si.n = mi.Point2f(u, v), mi.Vector3f(0, 0, 1), mi.Normal3f(0, 0, 1)
+        si.sh_frame = mi.Frame3f(si.n)
+        si.wavelengths = type(si.wavelengths)(dr.lerp(*VISIBLE, dr.arange(mi.Float, _CHECKED**2) / _CHECKED**2))
+        found = np.array(dr.detach(dr.min(mi.unpolarized_spectrum(self.bsdf.eval_diffuse_reflectance(si)))))
+        if not found.min() >= -1e-6:
+            raise RequestError(f"base: got a reflectance of {found.min():g}, wanted 0 or more")
 
     def context(self, ctx: mi.BSDFContext) -> mi.BSDFContext | None:
         """Return the context for the nested BSDF, whose components follow the grating's; None if none is requested."""

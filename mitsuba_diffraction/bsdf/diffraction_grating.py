@@ -217,7 +217,7 @@ def define() -> type:
             self.layers.traverse(callback)
 
         def parameters_changed(self, keys: Sequence[str] = ()) -> None:
-            self.layers.grating.parameters_changed(list(keys))
+            self.layers.parameters_changed(list(keys))
 
         def eval_pdf(
             self, ctx: mi.BSDFContext, si: mi.SurfaceInteraction3f, wo: mi.Vector3f, active: mi.Bool = True

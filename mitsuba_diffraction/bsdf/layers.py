@@ -83,6 +83,12 @@ class Layers:
         if self.base is not None:
             callback.put("base", self.base.bsdf, mi.ParamFlags.Differentiable)
 
+    def parameters_changed(self, keys: list[str]) -> None:
+        """Check the parameters `keys`, or all if there are none, and recompute what depends on them."""
+        if self.base is not None and (not keys or "base" in keys):
+            self.base.check()
+        self.grating.parameters_changed(keys)
+
     def _request(self, ctx: mi.BSDFContext) -> Request:
         return Request(
             ctx.is_enabled(mi.BSDFFlags.GlossyReflection, 0),

@@ -18,7 +18,7 @@ from ..materials import RefractiveIndex, is_file
 from ..precomputation import Spectrum, load_spectrum
 from ..recipe import REQUESTED, Recipe
 from ..rigorous.spectrum import RigorousSpectrum
-from ..settings import FROM_RADIUS, THEORIES, TRANSMISSIONS, VISIBLE, wavelengths_inside
+from ..settings import FROM_RADIUS, MIN_WAVELENGTH, THEORIES, TRANSMISSIONS, VISIBLE, wavelengths_inside
 from ..surface.gratings import PROFILES
 from .base import nested_plugin
 from .coat import SAME_INDEX, Coat, coat_from
@@ -103,6 +103,13 @@ class Media:
 def _densest(medium: RefractiveIndex, nominal: float) -> float:
     """Return the maximum index of a medium at visible wavelengths relative to its nominal one."""
     return float(medium(np.linspace(*VISIBLE, 100) * 1e-3).real.max() / nominal)
+
+    @property
+    def index_name(self) -> str:
+        """The parameter that gives `index`."""
+        if self.coat is not None:
+            return "coat_ior"
+        return "int_ior" if self.eta is not None and self.eta > 1 else "ext_ior"
 
 
 class Scales:
@@ -247,6 +254,11 @@ def _next_to_relief(theory: str, media: Media, scale: float, wavelengths: tuple[
     # Rigorous tables of a bare surface are for the wavelengths above it.
     if theory == "rigorous" and media.coat is None:
         return wavelengths
+    if media.index > (max_index := wavelengths[0] / MIN_WAVELENGTH):
+        raise RequestError(
+            f"{media.index_name}: got {media.index:.3g} with light of {wavelengths[0]:g} nm, wanted at most "
+            f"{max_index:.3g}: inside, wavelengths would be shorter than {MIN_WAVELENGTH:g} nm"
+        )
     return wavelengths_inside(media.index, scale, wavelengths)
 
 

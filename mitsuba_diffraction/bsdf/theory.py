@@ -209,9 +209,8 @@ class ScalarTheory(Theory):
         shortest = first / index
         # Without a scene nobody knows whether there is light at the wavelengths before the first of the spectrum.
         if (index > 1 or light) and shortest < self.spectrum.wavelengths[0] * (1 - 1e-6):
-            name, medium = "int_ior", "the material"
-            if self.media.eta is None:
-                name, medium = ("ext_ior", "it") if self.media.coat is None else ("coat_ior", "the coat")
+            name = self.media.index_name
+            medium = {"int_ior": "the material", "coat_ior": "the coat", "ext_ior": "it"}[name]
             got, why = f"{name}: got {index:g}", f"; inside {medium} they are shorter"
             if index == 1:
                 got, why = f"wavelengths: got light from {first:g} nm", ""

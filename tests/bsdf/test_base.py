@@ -311,3 +311,35 @@ def test_base_is_dark_from_behind():
         value, pdf = bsdf.eval_pdf(mi.BSDFContext(), interaction([0.6, 0, -0.8]), vectors([-0.6, 0, -0.8]))
         assert np.array(value).max() == 0
         assert np.array(pdf).max() == 0
+
+
+NEGATIVE = r"base: got a reflectance of -5, wanted 0 or more"
+
+
+@pytest.mark.parametrize(
+    ("reflectance", "key"),
+    [
+        (uniform(0.5), "value"),
+        ({"type": "checkerboard", "color0": uniform(0.1), "color1": uniform(0.9)}, "color1.value"),
+        (bitmap(np.full((8, 8, 1), 0.5)), "data"),
+    ],
+)
+def test_a_reflectance_changed_to_a_negative_one_is_refused(llvm, reflectance, key):
+    # Regression: it gave negative light.
+    bsdf = mi.load_dict(
+        {"type": "twosided", "nested": grating(int_ior=1.5, base={**DIFFUSE, "reflectance": reflectance})}
+    )
+    parameters = mi.traverse(bsdf)
+    (name,) = (name for name in parameters.keys() if name.endswith(f"base.reflectance.{key}"))  # noqa: SIM118
+    parameters[name] = 0.2 * parameters[name]
+    parameters.update()
+    values = np.array(parameters[name])
+    values[(-1,) * values.ndim] = -5
+    parameters[name] = type(parameters[name])(values)
+    with pytest.raises(ValueError, match=NEGATIVE):
+        parameters.update()
+
+
+def test_a_negative_reflectance_is_refused(llvm):
+    with pytest.raises(RuntimeError, match=NEGATIVE):
+        mi.load_dict(grating(int_ior=1.5, base={"type": "diffuse", "reflectance": uniform(-5)}))

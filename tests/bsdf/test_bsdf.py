@@ -277,6 +277,16 @@ def test_scales_too_large_for_any_spectrum_are_refused(llvm):
         mi.load_dict({"type": "diffraction_grating", "profile": "blazed", "height_scale": 1000.0})
 
 
+@pytest.mark.parametrize(
+    ("name", "others"),
+    [("int_ior", {"transmission": "interface"}), ("coat_ior", {"material": "Al"}), ("ext_ior", {"int_ior": 1.5})],
+)
+def test_an_index_too_large_for_any_spectrum_is_refused_by_its_name(llvm, name, others):
+    # Regression: "height_scale, lateral_scale: got up to 1, wanted at most 0.072".
+    with pytest.raises(RuntimeError, match=rf"{name}: got 100 with light of 360 nm, wanted at most 7\.2"):
+        mi.load_dict({"type": "diffraction_grating", "profile": "blazed", name: 100.0, **others})
+
+
 def test_constructors_leave_the_file_resolver_alone(llvm, monkeypatch):
     """mi.load_dict replaces it while other threads load plugins that need it: sunsky failed at times."""
     load = mi.load_dict

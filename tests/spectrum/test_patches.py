@@ -72,7 +72,8 @@ def test_another_number_of_patches_is_another_spectrum(recipe):
 @pytest.mark.parametrize(
     ("surface", "message"),
     [
-        ({**SURFACE, "patches": 0}, "patches: got 0, wanted a whole number of at least 1"),
+        ({**SURFACE, "patches": 0}, "patches: got 0, wanted a whole number from 1 to 1000"),
+        ({**SURFACE, "patches": 1000000}, "patches: got 1000000, wanted a whole number from 1 to 1000"),
         ({**SURFACE, "patches": -3}, "patches: got -3"),
         ({**SURFACE, "patches": 2.5}, "patches: got 2.5"),
         ({**SURFACE, "patches": "many"}, "patches: got 'many'"),
