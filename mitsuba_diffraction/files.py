@@ -2,23 +2,21 @@
 
 from __future__ import annotations
 
+import fcntl
+import glob
 import hashlib
 import importlib.util
 import io
 import os
-import re
 import secrets
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
-from typing import Any, BinaryIO
+from typing import BinaryIO
 
 import platformdirs
 
 from .errors import RequestError
-
-# Not on Windows, where temporary files in use cannot be recognised.
-fcntl: Any = importlib.import_module("fcntl") if importlib.util.find_spec("fcntl") else None
 
 _being_written: set[str] = set()  # temporary paths
 
@@ -49,32 +47,24 @@ def whole_file(path: str | os.PathLike[str]) -> Iterator[Path]:
     temporary, opened = _locked_temporary(target)
     _being_written.add(str(temporary))
     try:
-        try:
-            yield temporary
-            os.fsync(opened)
-        except OSError as error:
-            if error.errno is None or error.filename not in (None, str(temporary)):
-                raise
-            # A full disk, with the name that the caller knows.
-            raise OSError(error.errno, error.strerror, os.fspath(path)) from error
-        finally:
-            if fcntl is None:  # Windows renames no open file
-                os.close(opened)
+        yield temporary
+        os.fsync(opened)
         os.replace(temporary, target)
-    except BaseException:
+    except OSError as error:
+        if error.errno is None or error.filename not in (None, str(temporary)):
+            raise
+        # A full disk, with the name that the caller knows.
+        raise OSError(error.errno, error.strerror, os.fspath(path)) from error
+    finally:
         with suppress(OSError):
             temporary.unlink(missing_ok=True)
-        raise
-    finally:
         _being_written.remove(str(temporary))
-        if fcntl is not None:
-            os.close(opened)
-    if hasattr(os, "O_DIRECTORY"):  # makes the rename itself durable, where supported
-        folder = os.open(target.parent, os.O_DIRECTORY)
-        try:
-            os.fsync(folder)
-        finally:
-            os.close(folder)
+        os.close(opened)
+    folder = os.open(target.parent, os.O_DIRECTORY)
+    try:
+        os.fsync(folder)  # makes the rename itself durable
+    finally:
+        os.close(folder)
 
 
 @contextmanager
@@ -100,13 +90,12 @@ def exclusive(path: str | os.PathLike[str]) -> Iterator[None]:
     path = Path(path)
     lock = path.with_name(f".{path.name}.lock")
     with lock.open("wb") as stream:
-        if fcntl is not None:
-            try:
-                fcntl.flock(stream, fcntl.LOCK_EX | fcntl.LOCK_NB)
-            except BlockingIOError:
-                raise RequestError(f"{path}: another process is writing it, wanted one at a time") from None
-            except OSError:  # a file system without locks
-                pass
+        try:
+            fcntl.flock(stream, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except BlockingIOError:
+            raise RequestError(f"{path}: another process is writing it, wanted one at a time") from None
+        except OSError:  # a file system without locks
+            pass
         try:
             yield
         finally:
@@ -119,9 +108,8 @@ def _locked_temporary(target: Path) -> tuple[Path, int]:
         # Not tempfile.mkstemp, whose files are readable by their owner only, also after the rename.
         temporary = target.with_name(f".{target.stem}-{secrets.token_hex(8)}{target.suffix}")
         opened = os.open(temporary, os.O_RDWR | os.O_CREAT | os.O_EXCL, 0o666)
-        if fcntl is not None:
-            with suppress(OSError):  # a file system without locks
-                fcntl.flock(opened, fcntl.LOCK_EX)
+        with suppress(OSError):  # a file system without locks
+            fcntl.flock(opened, fcntl.LOCK_EX)
         if temporary.exists():  # not removed as a leftover by another process before it was locked
             return temporary, opened
         os.close(opened)
@@ -134,14 +122,10 @@ def discard(path: str | os.PathLike[str]) -> None:
 
 
 def _remove_stale_temporaries(target: Path) -> None:
-    if fcntl is None:
-        return
-    ours = re.compile(re.escape(f".{target.stem}-") + "[0-9a-f]{16}" + re.escape(target.suffix))
-    with suppress(OSError), os.scandir(target.parent) as entries:
-        for left in [Path(entry.path) for entry in entries if ours.fullmatch(entry.name)]:
-            with suppress(OSError), left.open("rb") as stream:  # locked, already gone, or of another user
-                fcntl.flock(stream, fcntl.LOCK_EX | fcntl.LOCK_NB)
-                left.unlink()
+    for left in target.parent.glob(f".{glob.escape(target.stem)}-{16 * '[0-9a-f]'}{glob.escape(target.suffix)}"):
+        with suppress(OSError), left.open("rb") as stream:  # locked, already gone, or of another user
+            fcntl.flock(stream, fcntl.LOCK_EX | fcntl.LOCK_NB)
+            left.unlink()
 
 
 def refuse_unwritable(path: str | os.PathLike[str]) -> None:
