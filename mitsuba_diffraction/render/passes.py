@@ -1,8 +1,8 @@
 """Path tracing in passes, with the standard error of their sum and checkpoints of unfinished renderings.
 
 A checkpoint is an uncompressed `.npz` file (noise does not compress) with the fields of `Accumulation` and the `digest`
-of the request (`passes.Job`). The comment of the archive is the SHA-256 of the file (`files.seal`). It takes 8 bytes
-per pixel and channel, and twice as much while it is being replaced.
+of the request (`passes.Job`). Each field has a CRC-32. It takes 8 bytes per pixel and channel, and twice as much while
+it is being replaced.
 
 To bound memory, a large picture is traced in bands of rows (`film.bands_of`): in each pass, band after band is added to
 its sums. One band is in memory, the others are in checkpoints of their own.
@@ -29,7 +29,7 @@ from functools import cache, cached_property, partial
 from importlib import metadata
 from pathlib import Path
 from typing import Any
-from zipfile import BadZipFile, ZipFile
+from zipfile import BadZipFile
 
 import mitsuba as mi
 import numpy as np
@@ -37,7 +37,7 @@ from numpy.typing import NDArray
 
 from ..color import spectrum_to_XYZ
 from ..errors import RequestError
-from ..files import UNSEALED, discard, exclusive, is_intact, seal, whole_file
+from ..files import discard, exclusive, whole_file
 from ..progress import stage
 from ..settings import VISIBLE
 from .film import (
@@ -177,12 +177,8 @@ def discard_checkpoints(checkpoint: str | os.PathLike[str]) -> None:
 
 def save_checkpoint(path: str | os.PathLike[str], digest: str, sums: Accumulation) -> None:
     """Write a checkpoint atomically: after a kill, a power cut or an OSError, `path` is the old or the new one."""
-    with whole_file(path) as temporary:
-        with open(temporary, "wb") as stream:
-            np.savez(stream, digest=digest, **vars(sums))
-        with ZipFile(temporary, "a") as archive:
-            archive.comment = UNSEALED.encode()
-        seal(temporary)
+    with whole_file(path) as temporary, open(temporary, "wb") as stream:
+        np.savez(stream, digest=digest, **vars(sums))
 
 
 def load_checkpoint(path: str | os.PathLike[str], digest: str) -> Accumulation | None:
@@ -195,8 +191,6 @@ def load_checkpoint(path: str | os.PathLike[str], digest: str) -> Accumulation |
         return None
     with open(path, "rb") as stream:
         try:
-            if not is_intact(path):
-                raise RequestError("its contents do not match its digest")
             with np.load(stream) as content:
                 if content["digest"].item() == digest:
                     stored = {field.name: content[field.name] for field in fields(Accumulation)}
