@@ -5,7 +5,6 @@ from __future__ import annotations
 import fcntl
 import glob
 import hashlib
-import importlib.util
 import io
 import os
 import secrets

@@ -23,7 +23,7 @@ from ..spectrum.tables import HALF_SCALE, SliceTable
 from ..surface.heightfield import HeightField
 from .arrays import encoded
 from .coil import coil
-from .surface import Surface
+from .surface import AIR, DISCS, Surface
 
 MAX_BYTES = 6_000_000  # of a page
 MAX_HEIGHTS_SIDE = 512  # pixels of the heights for the shader of 2014
@@ -35,6 +35,9 @@ METALS = ("Al", "Ag", "Au", "Cr", "Cu", "W")
 """The conductors among which a page chooses, besides that of the surface."""
 
 _SKINS = ("elaphe", "xenopeltis")  # profiles
+
+# Radii of the hole, and of the inner and outer edge of the tracks, relative to 60 mm (IEC 60908, ECMA-267).
+_RINGS = dict(zip(DISCS, ((7.5 / 60, 23 / 60, 58.5 / 60), (7.5 / 60, 22.6 / 60, 58.5 / 60)), strict=True))
 
 _ASSETS = Path(__file__).parent / "assets"
 _STYLES = ("page.css",)
@@ -96,9 +99,11 @@ def _data(surface: Surface, picture: NDArray[np.float16] | None) -> dict[str, An
         "name": surface.name,
         "summary": _summary(surface),
         "shape": _shape(surface),
+        "rings": _RINGS.get(_profile(surface)),
         "source": surface.spectrum.source,
         "version": metadata.version("mitsuba_diffraction"),
         "grating": dict(surface.grating),
+        "integers": [name for name, value in surface.grating.items() if isinstance(value, int)],
         "command": surface.command,
         "material": _material(surface),
         "spectrum": _spectrum(surface),
@@ -122,15 +127,21 @@ def _summary(surface: Surface) -> str:
 
 def _shape(surface: Surface) -> str:
     """Return the object that is shown first: the snake for skins and samples of other irregular surfaces."""
+    if _profile(surface) in _RINGS:
+        return "disc"
     if surface.material.orientation in FROM_RADIUS:
         return "plate"
-    profile = None if surface.recipe is None else surface.recipe.surface.get("profile")
-    return "coil" if surface.spectrum.extent == "sample" or profile in _SKINS else "sphere"
+    return "coil" if surface.spectrum.extent == "sample" or _profile(surface) in _SKINS else "sphere"
+
+
+def _profile(surface: Surface) -> str:
+    return "" if surface.recipe is None else str(surface.recipe.surface.get("profile"))
 
 
 def _material(surface: Surface) -> dict[str, Any]:
     orientation = surface.material.orientation
     return vars(surface.material) | {
+        "air": AIR,
         "orientation": FROM_RADIUS.get(orientation, orientation) if isinstance(orientation, str) else orientation,
         "from_radius": orientation in FROM_RADIUS,
         "max_height_scale": surface.max_height_scale,

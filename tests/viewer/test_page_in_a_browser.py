@@ -23,6 +23,7 @@ sync_api = pytest.importorskip("playwright.sync_api", reason="the package playwr
 
 RECIPES = Path(__file__).parents[2] / "precompute"
 CHROMIUM = shutil.which("chromium")
+DISC = {"material": "Al", "coat_ior": 1.55}
 OPTIONS = ["--use-angle=swiftshader", "--enable-unsafe-swiftshader", "--no-sandbox"]
 
 
@@ -94,6 +95,11 @@ def pairs_of(spectrum, count=10_000, seed=1):
     [
         pytest.param("blaze.toml", {}, {}, marks=pytest.mark.slow),
         ("blaze.toml", {"material": "Au", "height_scale": 0.7}, {}),
+        ("blaze.toml", {"material": "Au", "coat_ior": 1.6}, {}),
+        pytest.param("blaze.toml", {"coat_ior": 1.35}, {"hasBase": True, "pigment": "#7c3f95"}, marks=pytest.mark.slow),
+        pytest.param("foil_crossed.toml", {"material": "Al", "coat_ior": 1.5}, {}, marks=pytest.mark.slow),
+        pytest.param("elaphe_afm.toml", {"material": "Ag", "coat_ior": 1.5}, {}, marks=pytest.mark.slow),
+        pytest.param("compact_disc.toml", {}, {}, marks=pytest.mark.slow),
         pytest.param("foil_crossed.toml", {"material": "none"}, {}, marks=pytest.mark.slow),
         ("elaphe_afm.toml", {"int_ior": 1.5}, {"hasBase": True, "pigment": "#7c3f95"}),
         pytest.param("elaphe.toml", {"int_ior": 1.7}, {}, marks=pytest.mark.slow),
@@ -115,7 +121,7 @@ def test_values_are_those_of_the_bsdf(source, parameters, changes, opened, llvm)
     bsdf = mi.load_dict(
         {
             **{"type": "diffraction_grating", "filename": str(RECIPES / source), "conserve_energy": False},
-            **{**parameters, **base},
+            **{**parameters, **base, **(DISC if source == "compact_disc.toml" else {})},
         }
     )
     wanted = testing.evaluate(bsdf, pairs[:, :3], pairs[:, 3:6], pairs[:, 6:])[:, 0]
@@ -285,14 +291,16 @@ def test_the_axes_of_the_pattern_are_those_of_the_plugin(orientation, opened, ll
     for name, kind in (("sphere", "sphere"), ("plate", "rectangle"), ("disc", "disk")):
         tab.evaluate("(shape) => viewer.set({ shape, maxFrames: 1, azimuth: -60, elevation: 50 })", name)
         scene = tab.evaluate("viewer.scene()")
-        assert f'name="orientation" value="{orientation}"' in scene
+        # Mitsuba's disk has polar UVs.
+        in_scene = {"radial": 0, "tangential": 90}.get(orientation, orientation) if name == "disc" else orientation
+        assert f'name="orientation" value="{in_scene}"' in scene
         width, height = tab.evaluate("[viewer.renderer.width, viewer.renderer.height]")
         azimuth, elevation = tab.evaluate("[viewer.state.lightAzimuth, viewer.state.lightElevation]")
         light = testing.direction(90 - elevation, azimuth)
         sensor = mi.load_string(
             re.search("<sensor.*?</sensor>", scene, re.DOTALL)[0].replace("<sensor", '<sensor version="3.0.0"', 1)
         )
-        shape = mi.load_dict({"type": kind, "bsdf": grating})
+        shape = mi.load_dict({"type": kind, "bsdf": {**grating, "orientation": in_scene}})
         scene = mi.load_dict({"type": "scene", "shape": shape})
         for x, y in ((0.5, 0.5), (0.42, 0.47), (0.55, 0.53), (0.51, 0.4)):
             x, y = int(x * width), int(y * height)
@@ -303,6 +311,12 @@ def test_the_axes_of_the_pattern_are_those_of_the_plugin(orientation, opened, ll
             wanted = np.array(rotated(si.to_local(mi.Vector3f(light)), *frame)).ravel()
             found = tab.evaluate("([x, y]) => viewer.picker.directionsAt(x, y)", [x, y])
             np.testing.assert_allclose(found["wi"], wanted, atol=2e-3, err_msg=f"{name} {x} {y}")
+            if name == "disc" and orientation != 30:
+                # Regression: the tangent followed the centre of UV space, and the tracks were spirals.
+                radius = np.array(si.p).ravel()
+                radius /= np.linalg.norm(radius)
+                along = found["wi"][0] if orientation == "radial" else -found["wi"][1]
+                assert along == pytest.approx(light @ radius, abs=2e-3)
 
 
 @pytest.mark.slow
@@ -331,6 +345,50 @@ def test_the_copied_scene_renders_the_same_picture(opened, tmp_path, llvm):
     assert inside.sum() > 800
     assert difference.mean() <= 1
     assert delta_E(np.zeros(3), np.clip(exposure * wanted[inside], 0, 1)).mean() > 3
+
+
+def alpha_at(tab, x, y):
+    """The coverage of the mean at coordinates of the plane of a plate, seen from above."""
+    half = tab.evaluate("Math.tan((viewer.renderer.drawn[1] ? 14 : 0) * Math.PI / 180) * viewer.state.distance")
+    width, height = tab.evaluate("viewer.renderer.drawn")
+    scale = min(width, height) / (2 * half)
+    column, row = int(width / 2 + scale * x), int(height / 2 + scale * y)
+    values = tab.evaluate("([x, y]) => Array.from(viewer.renderer.model.mean.read(x, y, 1, 1))", [column, row])
+    return values[3], values[1]
+
+
+@pytest.fixture(scope="module")
+def disc():
+    """A compact disc of few pits."""
+    small = {"tracks": 2, "length": 12.5, "patches": 2, "coherence_length": 4.0}
+    return Surface.named("compact_disc", small)
+
+
+def test_a_disc_has_a_hole_and_clear_rings(disc, opened):
+    tab = opened(disc)
+    assert tab.evaluate("[viewer.state.shape, viewer.state.material, viewer.state.coat]") == ["disc", "Al", 1.55]
+    tab.evaluate("viewer.set({ maxFrames: 1, azimuth: -90, elevation: 89, sky: 1 })")
+    wait_for_frames(tab)
+    covers = [alpha_at(tab, radius, 0)[0] for radius in (0.05, 0.25, 0.6, 0.988, 1.1)]
+    assert covers == [0, 0.25, 1, 0.25, 0]
+    assert tab.messages == [tab.url[:80]]
+
+
+@pytest.mark.slow
+def test_the_scene_of_a_disc_has_its_rings(disc, opened, tmp_path, llvm):
+    """The picture of `view.xml` under the sky alone: the sky through the hole, nearly all of it through plastic."""
+    tab = opened(disc)
+    tab.evaluate("viewer.set({ maxFrames: 1, azimuth: -90, elevation: 89, sky: 1, lightElevation: -80 })")
+    scene = re.sub(r'"(width|height)" value="\d+"', r'"\1" value="64"', tab.evaluate("viewer.scene()"))
+    (tmp_path / "view.xml").write_text(scene)
+    image = render(tmp_path / "view.xml", spp=64)
+    half = np.tan(np.deg2rad(14)) * tab.evaluate("viewer.state.distance")
+    luminance = np.pi * spectrum_to_XYZ(image.radiance, image.wavelengths)[32, :, 1]
+    hole, plastic, metal, beside = (luminance[int(32 + 32 * radius / half)] for radius in (0.05, 0.25, 0.6, 1.05))
+    assert hole == pytest.approx(1, rel=0.01)
+    assert beside == pytest.approx(1, rel=0.01)
+    assert plastic == pytest.approx(1, rel=0.02)
+    assert 0.6 < metal < 0.95
 
 
 def test_a_reference_picture_is_compared(opened):

@@ -98,8 +98,9 @@ def test_a_page_holds_everything_is_small_and_ready_within_three_seconds(recipe)
     [
         ("blazed,theory=rigorous", "theory: got rigorous, wanted scalar"),
         ("blazed,transmission=sheet", "transmission: got 'sheet', and the page shows reflected light only"),
-        ("blazed,coat_ior=1.5", "coat_ior: got 1.5, and the page shows a grating without a coat"),
-        ("blazed,colour=red", "colour: got 'red', wanted a parameter among height_scale, int_ior, material"),
+        ("blazed,coat_ior=0.9", "coat_ior: got 0.9, wanted an index of 1 (no layer) to 10"),
+        ("blazed,coat_ior=glass", "coat_ior: got 'glass', wanted a number"),
+        ("blazed,colour=red", "colour: got 'red', wanted a parameter among coat_ior, height_scale, int_ior, material"),
         ("blazed,material=Alu", "material: got 'Alu', did you mean Al"),
         ("blazed,material=Al,int_ior=1.5", "material: a conductor or a perfect mirror takes no int_ior"),
         ("blazed,height_scale=2", "height_scale: got 2, wanted at most 1: the spectrum was built for wavelengths"),
@@ -157,3 +158,37 @@ def test_the_light_and_the_observer_are_those_of_colour_science():
     np.testing.assert_allclose(table[:, :3], wanted, rtol=1e-5, atol=1e-9)
     light = daylight(wavelengths)
     np.testing.assert_allclose(table[:, 3], light / (light @ wanted[:, 1]), rtol=1e-5)
+
+
+@pytest.mark.parametrize("source", ["compact_disc", "dvd", "recipe.toml"])
+def test_a_disc_opens_under_plastic_with_its_tracks_round_the_centre(source, command, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    profile = "compact_disc" if source == "recipe.toml" else source
+    numbers = {"tracks": 2, "length": 12.5, "patches": 1, "coherence_length": 4}
+    settings = ",".join(f"{name}={value}" for name, value in numbers.items())
+    of_surface = f'[surface]\nprofile = "{profile}"\ntracks = 2\nlength = 12.5\npatches = 1\n'
+    Path("recipe.toml").write_text(f"{of_surface}[spectrum]\ncoherence_length = 4.0\n")
+    request = source if source.endswith(".toml") else f"{source},{settings}"
+    for given, wanted in (
+        ("", ("Al", 1.55, True, 0.0)),
+        (",material=Au,coat_ior=1", ("Au", 1, True, 0.0)),
+        (",int_ior=1.4,orientation=30", ("", 1.55, False, 30)),
+    ):
+        code, _, error = command(f"view {request}{given} --no-open -o disc.html")
+        assert code == 0, error
+        data = json.loads(re.search(r'<script id="data".*?>(.*?)</script>', Path("disc.html").read_text())[1])
+        material = data["material"]
+        assert tuple(material[name] for name in ("material", "coat_ior", "from_radius", "orientation")) == wanted
+        assert data["shape"] == "disc"
+        # From the hole of 15 mm to the edge of 120 mm, tracks from about 46 to 117 mm.
+        hole, first, last = data["rings"]
+        assert (hole, last) == (0.125, 0.975)
+        assert first == pytest.approx(46 / 120, rel=0.02)
+
+
+def test_a_coat_that_a_saved_spectrum_does_not_cover_is_refused(command, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    md.precompute(md.gratings.blazed(1.0, 0.02, samples=32), coherence_length=2).save("saved.exr")
+    code, _, error = command("view saved.exr,coat_ior=1.5 --no-open")
+    assert code == 2
+    assert "coat_ior: got 1.5, wanted at most 1: the spectrum was built for wavelengths from 360 nm" in error

@@ -1,4 +1,5 @@
-// Position, normal and tangent of a sphere, a plate or a disc; they lie about the origin, with radius one.
+// Position, normal and tangent of a sphere, a plate or a disc; they lie about the origin, with radius one. The fourth
+// component of a position is the coverage: of the grating one, of clear plastic beside it CLEAR.
 uniform int uShape;
 uniform vec3 uEye;
 uniform mat3 uCamera;   // columns: right, up, back
@@ -6,11 +7,12 @@ uniform vec2 uTangentOfView;
 uniform vec2 uJitter;
 uniform vec2 uSize;
 uniform bool uFromRadius;  // whether the tangent points away from the centre of UV space
+uniform vec3 uRings;       // of a disc, between the radii of its hole, and of the inner and outer edge of its grating
 layout(location = 0) out vec4 oPosition;
 layout(location = 1) out vec4 oNormal;
 layout(location = 2) out vec4 oTangent;
 
-const float PI = 3.14159265;
+const float PI = 3.14159265, CLEAR = 0.25;
 
 // The image of the radius in UV space; U and V are the derivatives of the position.
 vec4 tangentOf(vec2 uv, vec3 U, vec3 V) {
@@ -45,14 +47,15 @@ void main() {
   float t = -uEye.z / ray.z;
   if (t < 0.0) return;
   vec3 p = uEye + t * ray;
-  bool inside = uShape == 1 ? max(abs(p.x), abs(p.y)) <= 1.0 : dot(p.xy, p.xy) <= 1.0;
+  float r = length(p.xy);
+  bool inside = uShape == 1 ? max(abs(p.x), abs(p.y)) <= 1.0 : r >= uRings.x && r <= 1.0;
   if (!inside) return;
-  oPosition = vec4(p, 1.0);
+  oPosition = vec4(p, uShape == 1 || (r >= uRings.y && r <= uRings.z) ? 1.0 : CLEAR);
   oNormal = vec4(0.0, 0.0, 1.0, 0.0);
   if (uShape == 1) {
     oTangent = tangentOf(0.5 * p.xy + 0.5, vec3(2.0, 0.0, 0.0), vec3(0.0, 2.0, 0.0));
   } else {
-    float r = length(p.xy);
-    oTangent = tangentOf(vec2(r, angleOf(p.xy)), vec3(p.xy / max(r, 1e-6), 0.0), 2.0 * PI * vec3(-p.y, p.x, 0.0));
+    // Mitsuba's disk has polar UVs, so that its tangent points outwards.
+    oTangent = vec4(p.xy / max(r, 1e-6), 0.0, 0.0);
   }
 }

@@ -14,10 +14,13 @@ function sceneOf(data, state, coil) {
   const differs = Math.abs(state.coherenceLength / own - 1) > 1e-3;
   if (grating.profile && differs) grating.coherence_length = Number(state.coherenceLength.toPrecision(4));
   const material = state.material === "dielectric" ? { int_ior: state.index } : { material: state.material };
-  const orientation = state.fromRadius ? (state.orientation === 0 ? "radial" : "tangential") : state.orientation;
-  const parameters = { ...grating, ...material, orientation, height_scale: state.heightScale, conserve_energy: false };
+  // The UVs of a disk are polar, so that 0 is radial.
+  const named = state.fromRadius && state.shape !== "disc";
+  const orientation = named ? (state.orientation === 0 ? "radial" : "tangential") : state.orientation;
+  const coat = state.coat === 1 ? {} : { coat_ior: state.coat };
+  const parameters = { ...grating, ...material, ...coat, orientation, height_scale: state.heightScale, conserve_energy: false };
   const lines = Object.entries(parameters).map(([name, value]) =>
-    name === "patches" || name === "seed" || name === "samples" ? element(name, value).replace(/float/, "integer") : element(name, value));
+    data.integers.includes(name) ? element(name, value).replace(/float/, "integer") : element(name, value));
   if (state.hasBase && state.material === "dielectric") {
     lines.push(`<bsdf type="diffuse" name="base"><rgb name="reflectance" value="${list(linearOf(state.pigment))}"/></bsdf>`);
   }
@@ -40,6 +43,9 @@ function sceneOf(data, state, coil) {
     `<string name="filename" value="scenes/coil/snake.ply"/>
     <transform name="to_world"><translate value="${list(scaled(coil.middle, -1))}"/><scale value="${coil.scale.toFixed(6)}"/></transform>
     `];
+  const bsdf = `<bsdf type="diffraction_grating">
+      ${lines.join("\n      ")}
+    </bsdf>`;
   const { width, height } = $("canvas");
   return `<scene version="3.0.0">
 ${note}  <integrator type="path"><integer name="max_depth" value="2"/></integrator>
@@ -49,12 +55,27 @@ ${note}  <integrator type="path"><integer name="max_depth" value="2"/></integrat
     <film type="hdrfilm"><integer name="width" value="${width}"/><integer name="height" value="${height}"/><rfilter type="box"/></film>
   </sensor>
   <shape type="${shape[0]}">
-    ${shape[1]}<bsdf type="diffraction_grating">
-      ${lines.join("\n      ")}
-    </bsdf>
+    ${shape[1]}${state.shape === "disc" && data.rings ? ofRings(data.rings, state.coat, bsdf) : bsdf}
   </shape>
   ${emitter}${sky}
 </scene>`;
+}
+
+// A texture that is one where u, of a disk the radius, lies between two numbers, and zero elsewhere.
+function ring(name, first, last) {
+  const scale = 0.5 / (last - first);
+  return `<texture type="checkerboard" name="${name}"><float name="color0" value="0"/><float name="color1" value="1"/>
+      <transform name="to_uv"><scale x="${scale.toFixed(6)}" y="1e-6"/><translate x="${(-first * scale).toFixed(6)}" y="1e-7"/></transform></texture>`;
+}
+
+// A grating between two radii of a clear disc with a hole.
+function ofRings([hole, first, last], coat, bsdf) {
+  if (coat === 1) return `<bsdf type="mask">${ring("opacity", first, last)}
+    ${bsdf}</bsdf>`;
+  return `<bsdf type="mask">${ring("opacity", hole, 1.5)}
+    <bsdf type="blendbsdf">${ring("weight", first, last)}
+    <bsdf type="thindielectric"><float name="int_ior" value="${coat}"/></bsdf>
+    ${bsdf}</bsdf></bsdf>`;
 }
 
 // The same words in bash and PowerShell.

@@ -13,6 +13,7 @@ const NUMBERS = {
   heightScale: (x) => `× ${x.toFixed(2)}`,
   coherenceLength: (x) => `${x.toPrecision(3)} µm`,
   index: (x) => x.toFixed(2),
+  coat: (x) => (x === 1 ? "none" : x.toFixed(2)),
   terms: (x) => String(x),
   brightness: (x) => x.toPrecision(3),
 };

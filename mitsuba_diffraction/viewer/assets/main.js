@@ -8,13 +8,18 @@ const BUSY_MILLISECONDS = 60;  // of a frame while dragging, above which fewer p
 
 const shapeOf = (data) => (data.shape === "coil" && !data.coil ? "sphere" : data.shape);
 
-// A skin on a snake; other surfaces on a plate or a sphere, in a sky that shows a metal as metal.
+// A skin on a snake, a disc beside a strip that casts its rainbows; other surfaces on a plate or a sphere, in a sky that
+// shows a metal as metal.
 function firstView(data) {
   if (shapeOf(data) === "coil") {
     return { azimuth: -60, elevation: 38, distance: 4.6, lightAzimuth: -20, lightElevation: 40,
       lightWidth: 8, lightLength: 0, sky: 0.05, hasBase: data.material.material === "", pigment: "#100c0a" };
   }
   const isDielectric = data.material.material === "";
+  if (shapeOf(data) === "disc") {
+    return { azimuth: -90, elevation: 45, distance: 4.6, lightAzimuth: 0, lightElevation: 50,
+      lightWidth: 5, lightLength: 50, sky: 0.05, hasBase: isDielectric, pigment: "#141a22" };
+  }
   const lines = data.spectrum.max_order.includes(0);
   return { azimuth: -90, elevation: 20, distance: 5.2, lightAzimuth: -75, lightElevation: 35,
     lightWidth: 6, lightLength: lines ? 60 : 0, sky: isDielectric ? 0.02 : 0.3, hasBase: isDielectric, pigment: "#141a22" };
@@ -27,6 +32,7 @@ function initialState(data) {
     orientation: material.orientation,
     fromRadius: material.from_radius,
     heightScale: material.height_scale,
+    coat: material.coat_ior, air: material.air,
     coherenceLength: spectrum.coherence_length,
     material: material.material === "" ? "dielectric" : material.material,
     index: material.int_ior,
@@ -44,6 +50,8 @@ function prepareControls(data) {
   if (!data.coil || data.material.from_radius) $("shape").querySelector("[value=coil]").remove();
   $("orientation").disabled = data.material.from_radius;
   $("heightScale").max = data.material.max_height_scale;
+  $("coat").max = data.material.coat_ior;
+  $("coat").closest(".row").hidden = data.material.coat_ior === 1;
   const [shortest, longest] = coherenceLengths(spectrum);
   Object.assign($("coherenceLength"), { min: Math.log(shortest), max: Math.log(longest), step: "any" });
   $("coherenceLength").disabled = shortest === longest;

@@ -1,8 +1,9 @@
-// f = R K G S(q; kappa)/lambda^2 + (1 - R_i)(1 - R_o) base/pi, in 1/sr: bsdf/orders.py, bsdf/continuum.py,
-// bsdf/geometry.py and geometry.py of the package, for reflected light without a coat. E is one.
+// f = T_i T_o R K G S(q; kappa)/lambda^2 + (1 - R_i)(1 - R_o) base/pi, in 1/sr: bsdf/orders.py, bsdf/continuum.py,
+// bsdf/geometry.py, bsdf/coat.py and geometry.py of the package, for reflected light. E is one.
 // KIND, MATERIAL, CUBIC and HAS_BASE are constants of the program (spectrum.js), since some renderers execute both
 // branches of a condition.
-// Directions are unit vectors along the pattern's axes, z the normal, both away from the surface. Lengths are in um.
+// Directions are unit vectors along the pattern's axes, z the normal, both away from the surface; outside of a coat, which
+// keeps their tangential components. Lengths are in um.
 
 uniform highp sampler2DArray uTable;  // a_p of c = sum_p a_p t^p: columns m_x, rows m_y, layers intervals of kappa
 uniform float uUnit;                  // factor of the table
@@ -19,15 +20,19 @@ uniform float uHeightScale;
 uniform float uMinCosine;
 uniform bool uShadowing;
 
-uniform float uEta;
+uniform float uCoat;                  // index of a clear layer over the relief; one without
+uniform float uEta;                   // index of the material relative to the layer
 uniform highp sampler2D uIndex;       // n + ik at each nm from 360
 uniform vec3 uPigment;                // coefficients of the reflectance of the base
+
+uniform float uSky;                   // radiance of the sky relative to the irradiance of the light
 
 const int DIELECTRIC = 0, CONDUCTOR = 1, MIRROR = 2;
 const int RESOLVED = 0, LINES = 1, WINDOW = 2, SPLINES = 3;
 const int MARGIN = 3;  // of the table, in nodes
 const float PI = 3.14159265358979;
 const float SHORTEST = 360.0, LONGEST = 830.0;
+const vec3 D65 = vec3(0.9505, 1.0, 1.089);
 
 float horizonGain(float x) {
   float t = max(1.0 - 0.25 * x, 0.0);
@@ -40,9 +45,14 @@ float horizonGain(float x) {
   return 1.0 + t * t * p;
 }
 
+// k_z next to the relief, from the cosine outside.
+float inner(float cosine) {
+  return sqrt(max(cosine * cosine + (uCoat * uCoat - 1.0), 1e-12));
+}
+
 // K G from cos^2 of both directions and |lambda q|^2.
 float kG(vec2 squares, float tangentSquare) {
-  vec2 k = sqrt(max(squares, 1e-12));
+  vec2 k = sqrt(max(squares + (uCoat * uCoat - 1.0), 1e-12));
   float vz = k.x + k.y;
   vec2 a = (tangentSquare + vz * vz) / (2.0 * k);
   float perVz = 1.0 / vz;
@@ -94,7 +104,7 @@ float steepFactor(vec3 wi, vec3 wo, vec2 tangent) {
 
 // kappa in intervals of the table.
 float intervalsOf(vec3 wi, vec3 wo, float frequency) {
-  return (wi.z + wo.z) * 2.0 * PI * frequency * uHeightScale * uIntervalsPerKappa;
+  return (inner(wi.z) + inner(wo.z)) * 2.0 * PI * frequency * uHeightScale * uIntervalsPerKappa;
 }
 
 // The interval, and the powers of t in it.
@@ -166,14 +176,34 @@ float scatter(vec3 wi, vec3 wo, float lambda) {
 }
 
 float dielectricOf(float cosine, float eta) {
-  float inside = sqrt(max(1.0 - (1.0 - cosine * cosine) / (eta * eta), 0.0));
-  float s = (cosine - eta * inside) / max(cosine + eta * inside, 1e-12);
-  float p = (eta * cosine - inside) / max(eta * cosine + inside, 1e-12);
+  float square = eta * eta, inside = sqrt(max(square - 1.0 + cosine * cosine, 0.0));  // k_z; without cancellation
+  float s = (cosine - inside) / max(cosine + inside, 1e-12);
+  float p = (square * cosine - inside) / max(square * cosine + inside, 1e-12);
   return 0.5 * (s * s + p * p);
 }
 
 float dielectric(float cosine) {
   return dielectricOf(cosine, uEta);
+}
+
+// The face of the coat, at the cosine outside.
+float face(float cosine) {
+  return dielectricOf(cosine, uCoat);
+}
+
+// What enters a dielectric, through its coat.
+float transmittance(float cosine) {
+  return (1.0 - face(cosine)) * (1.0 - dielectric(min(inner(cosine) / uCoat, 1.0)));
+}
+
+// cos of the angle between both directions and their half vector, next to the relief.
+float halfCosine(vec3 wi, vec3 wo) {
+  return min(0.5 * length(vec3(wi.xy + wo.xy, inner(wi.z) + inner(wo.z))) / uCoat, 1.0);
+}
+
+// Whether the table has the angles of both directions.
+bool covered(vec3 wi, vec3 wo) {
+  return inner(min(wi.z, wo.z)) >= uMinCosine * uCoat;
 }
 
 float conductor(float cosine, vec2 index) {
@@ -187,15 +217,15 @@ float conductor(float cosine, vec2 index) {
   return 0.5 * (s + p);
 }
 
-// n + ik of a conductor.
+// n + ik of a conductor relative to the coat.
 vec2 indexAt(float nanometres) {
   float at = clamp(nanometres - SHORTEST, 0.0, LONGEST - SHORTEST);
   int below = int(min(floor(at), LONGEST - SHORTEST - 1.0));
   vec2 low = texelFetch(uIndex, ivec2(below, 0), 0).xy, high = texelFetch(uIndex, ivec2(below + 1, 0), 0).xy;
-  return mix(low, high, at - float(below));
+  return mix(low, high, at - float(below)) / uCoat;
 }
 
-// R of a plane; lambda in nm.
+// R of a plane at a cosine next to it; lambda in nm.
 float reflectance(float cosine, float nanometres) {
   if (MATERIAL == MIRROR) return 1.0;
   return MATERIAL == DIELECTRIC ? dielectric(cosine) : conductor(cosine, indexAt(nanometres));
@@ -209,16 +239,16 @@ float pigment(float nanometres) {
 float brdf(vec3 wi, vec3 wo, float nanometres) {
   if (wi.z <= 0.0 || wo.z <= 0.0) return 0.0;
   float result = 0.0;
-  if (min(wi.z, wo.z) >= uMinCosine) {
+  if (covered(wi, wo)) {
     float lambda = 1e-3 * nanometres;
     float power = scatter(wi, wo, lambda);
     if (power > 0.0) {
-      vec3 v = wi + wo;
-      result = power * reflectance(min(0.5 * length(v), 1.0), nanometres) / (lambda * lambda);
+      result = power * reflectance(halfCosine(wi, wo), nanometres) / (lambda * lambda);
+      result *= (1.0 - face(wi.z)) * (1.0 - face(wo.z));
     }
   }
   if (HAS_BASE) {
-    result += (1.0 - dielectric(wi.z)) * (1.0 - dielectric(wo.z)) * pigment(nanometres) / PI;
+    result += transmittance(wi.z) * transmittance(wo.z) * pigment(nanometres) / PI;
   }
   return result;
 }

@@ -5,7 +5,6 @@ uniform vec4 uSpectrum[48];         // of this frame: x, y, z times light times 
 uniform vec2 uIndices[48];          // n + ik there
 uniform vec3 uPigmentColour;        // XYZ of the pigment under the light
 uniform highp sampler2D uSkyColour; // XYZ of a surface under a sky of radiance one, by its cosine
-uniform float uSky;                 // radiance of the sky relative to the irradiance of the light
 
 const float FIRST = 380.0, LAST = 740.0;  // nm
 const int POINTS = KIND != RESOLVED ? 16 : LIGHT == 0 ? 1 : 4, EACH = 3;
@@ -27,7 +26,7 @@ vec3 matchingAt(float nanometres) {
 // Of f over three of the wavelengths.
 vec3 overWavelengths(vec3 wi, vec3 wo, int point) {
   vec2 tangent = -(wi.xy + wo.xy);
-  float cosHalf = min(0.5 * length(wi + wo), 1.0), plane = MATERIAL == DIELECTRIC ? dielectric(cosHalf) : 1.0;
+  float cosHalf = halfCosine(wi, wo), plane = MATERIAL == DIELECTRIC ? dielectric(cosHalf) : 1.0;
   bool steep = (KIND == SPLINES || KIND == WINDOW) && max(wi.z, wo.z) >= 0.4;
   float factor = steep ? steepFactor(wi, wo, tangent) * plane : plane, perFrequency = intervalsOf(wi, wo, 1.0);
   vec3 result = vec3(0.0);
@@ -57,7 +56,7 @@ vec3 overOrders(vec3 wi, vec3 wo, vec2 u) {
   float margin = uHalfWidth[axis] * uPerPitch[axis];
   int first = max(int(ceil(min(ends.x, ends.y) - margin)), -uMaxOrder[axis]);
   int last = min(int(floor(max(ends.x, ends.y) + margin)), uMaxOrder[axis]);
-  float cosHalf = min(0.5 * length(wi + wo), 1.0), perFrequency = intervalsOf(wi, wo, 1.0);
+  float cosHalf = halfCosine(wi, wo), perFrequency = intervalsOf(wi, wo, 1.0);
   bool narrow = spread < 0.15 * (HIGH - LOW);
   int samples = narrow ? 1 : 8;
   vec3 result = vec3(0.0);
@@ -117,17 +116,18 @@ vec4 lightFor(int n, vec3 wo) {
 vec3 radiance(vec3 wo) {
   vec3 result = vec3(0.0);
   if (wo.z <= 0.0) return result;
-  float transmitted = HAS_BASE ? 1.0 - dielectric(wo.z) : 0.0;
+  float transmitted = HAS_BASE ? transmittance(wo.z) : 0.0;
   for (int n = 0; n < POINTS; n++) {
     vec4 light = lightFor(n, wo);  // other points of the light for other wavelengths
     vec3 wi = light.xyz;
     if (wi.z <= 0.0 || light.w <= 0.0) continue;
     vec3 value = vec3(0.0);
-    if (min(wi.z, wo.z) >= uMinCosine) {
+    if (covered(wi, wo)) {
       value = KIND == RESOLVED ? overOrders(wi, wo, fract(random.zw + float(n) * vec2(0.6287067210378, 0.5385972572236)))
                                 : overWavelengths(wi, wo, n);
+      value *= (1.0 - face(wi.z)) * (1.0 - face(wo.z));
     }
-    if (HAS_BASE) value += transmitted * (1.0 - dielectric(wi.z)) / PI * uPigmentColour;
+    if (HAS_BASE) value += transmitted * transmittance(wi.z) / PI * uPigmentColour;
     result += wi.z * light.w * value;
   }
   result /= float(POINTS);

@@ -165,6 +165,7 @@ class Renderer {
         uJitter: jitter,
         uSize: [width, height],
         uFromRadius: Number(state.fromRadius),
+        uRings: this.data.rings || [0, 0, 1],
       });
       this.quad();
       return;

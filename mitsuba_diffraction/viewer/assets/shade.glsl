@@ -1,5 +1,5 @@
 // Adds a frame to the mean of those before: XYZ, and the coverage of the pixel.
-uniform highp sampler2D uPosition;  // w: whether there is a surface
+uniform highp sampler2D uPosition;  // w: the coverage, one of the grating
 uniform highp sampler2D uNormal;
 uniform highp sampler2D uTangent;
 uniform highp sampler2D uBefore;
@@ -35,6 +35,19 @@ vec4 lightAt(int n) {
   return lightTo(place);
 }
 
+// XYZ of what the face of the coat mirrors: the light and the sky.
+vec3 mirrored(vec3 wo) {
+  vec3 direction = vec3(-wo.xy, wo.z);
+  float radiance = uSky;
+  if (LIGHT != 0) {
+    vec2 at = vec2(dot(direction, lightAxes[0]), dot(direction, lightAxes[1])) / (uLightSize * uLightSize);
+    at /= max(dot(direction, lightAxes[2]), 1e-9);
+    bool seen = LIGHT == 1 ? dot(at, at) <= 1.0 : max(abs(at.x), abs(at.y)) <= 1.0;
+    if (seen) radiance += 1.0 / ((LIGHT == 1 ? PI : 4.0) * uLightSize.x * uLightSize.y);
+  }
+  return face(wo.z) * radiance * D65;
+}
+
 void main() {
   ivec2 at = ivec2(gl_FragCoord.xy);
   vec4 position = texelFetch(uPosition, at, 0);
@@ -48,7 +61,10 @@ void main() {
     vec3 width = normalize(cross(vec3(0.0, 0.0, 1.0), uLight));
     lightAxes = mat3(uLightSize.x * (width * frame), uLightSize.y * (cross(uLight, width) * frame), uLight * frame);
     random = uRandom + vec4(hash(uvec2(at)), hash(uvec2(at) + 7919u), hash(uvec2(at) + 104729u), hash(uvec2(at) + 15485863u));
-    value = vec4(radiance(normalize(uEye - position.xyz) * frame), 1.0);
+    vec3 wo = normalize(uEye - position.xyz) * frame;
+    vec3 xyz = wo.z > 0.0 ? mirrored(wo) : vec3(0.0);
+    if (position.w == 1.0) xyz += radiance(wo);
+    value = position.w * vec4(xyz, 1.0);
   }
   vec4 before = texelFetch(uBefore, at, 0);
   oMean = uWeight >= 1.0 ? value : mix(before, value, uWeight);

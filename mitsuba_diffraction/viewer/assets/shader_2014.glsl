@@ -299,7 +299,7 @@ vec3 radiance(vec3 wo) {
       below += STEP * pigment(nanometres) * weights.w * weights.xyz;
     }
     below *= light.w * light.z / PI;
-    below *= uConstantBlend ? 0.5 : (1.0 - dielectric(light.z)) * (1.0 - dielectric(wo.z));
+    below *= uConstantBlend ? 0.5 : transmittance(light.z) * transmittance(wo.z);
     if (uConstantBlend) rgb *= 0.5;
   }
   return uFromRGB * max(rgb, 0.0) + below;

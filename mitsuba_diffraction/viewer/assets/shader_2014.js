@@ -192,7 +192,8 @@ class Shader2014 {
     const hasFreeScale = state.right === "gem" || quirks.relative;
     const radius = (size, k) => (quirks.one_texel ? 1 : Math.min(Math.max(Math.ceil(2 * sigmas[k] * size - 0.5), 1), 16));
     return {
-      ...this.model.uniforms(state),
+      ...this.model.uniforms({ ...state, coat: 1 }),
+      uSky: 0,
       uTexels: texels,
       uTexelOrder: this.order,
       uPixels: [this.columns, this.rows],

@@ -113,10 +113,11 @@ const bool CUBIC = ${this.terms === 4}, HAS_BASE = ${state.hasBase && dielectric
       uHeightScale: state.heightScale,
       uMinCosine: Math.cos((spectrum.largest_angle * Math.PI) / 180) * (1 - 1e-6),
       uShadowing: 1,
-      uEta: state.index,
+      uCoat: Math.max(state.coat / state.air, 1),
+      uEta: state.index / state.coat,
       uIndex: metal ? metal.texture : this.noIndex,
       uPigment: state.hasBase ? pigmentOf(state.pigment) : [0, 0, 0],
-      uEntered: entered(state.index),
+      uEntered: entered(state.index, state.coat),
     };
   }
 }
@@ -143,7 +144,7 @@ function wavelengthsOf(state, metal, offset) {
     const x = (a * nm + b) * nm + c;
     xyz.forEach((value, k) => { pigment[k] += value * (0.5 + (0.5 * x) / Math.sqrt(1 + x * x)); });
     spectrum.push(...xyz, nm);
-    indices.push(...(metal ? [at(metal.values, 2, nm, 0), at(metal.values, 2, nm, 1)] : [1, 0]));
+    indices.push(...(metal ? [0, 1].map((k) => at(metal.values, 2, nm, k) / state.coat) : [1, 0]));
   }
   return { uSpectrum: spectrum, uIndices: indices, uPigmentColour: pigment };
 }
@@ -155,10 +156,14 @@ function fresnel(cosine, eta) {
   return 0.5 * (s * s + p * p);
 }
 
-// The fraction of diffuse light that a plane lets in.
-function entered(eta) {
+// The fraction of diffuse light that a plane lets in, through a coat.
+function entered(index, coat) {
   const count = 64;
   let sum = 0;
-  for (let i = 0; i < count; i++) sum += 1 - fresnel(Math.sqrt((i + 0.5) / count), eta);
+  for (let i = 0; i < count; i++) {
+    const cosine = Math.sqrt((i + 0.5) / count);
+    const inside = Math.sqrt(1 - (1 - cosine * cosine) / coat ** 2);
+    sum += (1 - fresnel(cosine, coat)) * (1 - fresnel(inside, index / coat));
+  }
   return sum / count;
 }
