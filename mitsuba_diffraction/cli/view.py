@@ -13,6 +13,7 @@ import typer
 from ..files import whole_file
 from ..outputs import check_outputs
 from ..progress import NAME, progress_bar, say, tell
+from ..recipe import Recipe
 from ..viewer.page import page, reference_picture
 from ..viewer.surface import Surface
 from .arguments import (
@@ -33,50 +34,68 @@ from .arguments import (
 @takes_scan
 def view(
     context: typer.Context,
-    source: Annotated[
-        str,
+    sources: Annotated[
+        list[str],
         typer.Argument(
-            metavar="SURFACE[,name=value…]",
+            metavar="SURFACE[,name=value…]…",
             help="a recipe (.toml), a saved spectrum (.exr), a profile, or a scan; name=value: material, int_ior, "
-            "orientation, height_scale, and the parameters of a profile",
+            "coat_ior, orientation, height_scale, and the parameters of a profile; several are a list in one page",
         ),
     ],
-    output: Annotated[Path | None, typer.Option("-o", "--output", help="the page; default: ./NAME.html")] = None,
+    output: Annotated[
+        Path | None, typer.Option("-o", "--output", help="the page; default: ./NAME.html, of several ./surfaces.html")
+    ] = None,
     reference: Annotated[
         Path | None, typer.Option(help="a spectral picture (.exr) of `render`, for comparison in the page")
     ] = None,
     open_page: Annotated[bool, typer.Option("--open/--no-open", help="open the page in the browser")] = True,
     overwrite: Overwrite = False,
 ) -> None:
-    """Write a page that shades a surface live in the browser (WebGL2), without network."""
-    name, parameters = surface_of(source)
-    path, progress = Path(name), functools.partial(progress_bar, unit="%")
-    target = output or Path(path.stem or "view").with_suffix(".html")
+    """Write a page that shades surfaces live in the browser (WebGL2), without network."""
+    requests = [surface_of(source) for source in sources]
+    stem = Path(requests[0][0]).stem or "view"
+    target = output or Path(stem if len(requests) == 1 else "surfaces").with_suffix(".html")
     check_suffix("-o", target, ".html")
     of_scan, settings = options_of_scan(context), settings_of(context)
-    recipe, of_a_scan = None, is_scan(name)
-    if of_a_scan or of_scan or settings:
-        recipe = recipe_of(path, of_scan, settings)
-    reads = [file for file in (path, reference) if file is not None and file.exists()]
-    check_outputs([*reads, *(recipe.files if recipe else [])], [("-o", target)], overwrite=overwrite)
+    # Beside a scan, its options are not those of the other surfaces.
+    has_scan = any(is_scan(name) for name, _ in requests)
+    recipes = [
+        recipe_of(Path(name), of_scan, settings) if is_scan(name) or ((of_scan or settings) and not has_scan) else None
+        for name, _ in requests
+    ]
+    reads = [file for file in (*(Path(name) for name, _ in requests), reference) if file is not None and file.exists()]
+    files = [file for recipe in recipes if recipe is not None for file in recipe.files]
+    check_outputs([*reads, *files], [("-o", target)], overwrite=overwrite)
     picture = None if reference is None else reference_picture(reference)
-    if recipe is None:
-        surface = Surface.named(name, parameters, progress)
-    else:
-        spectrum = f"{path.stem}.exr"
-        options = _words(given_of(context, SCAN_OPTIONS) | ({"extent": recipe.settings.extent} if of_a_scan else {}))
-        command = shlex.join([NAME, "precompute", path.name, *options, "-o", spectrum])
-        surface = Surface.of_recipe(recipe, path.stem, {"filename": spectrum}, parameters, progress, command)
+    surfaces = [
+        _surface(context, name, parameters, recipe)
+        for (name, parameters), recipe in zip(requests, recipes, strict=True)
+    ]
+    text = page(*surfaces, picture=picture)
+    with whole_file(target) as temporary:
+        temporary.write_text(text, encoding="utf-8")
+    shown = surfaces[0].spectrum.source if len(surfaces) == 1 else f"{len(surfaces)} surfaces"
+    tell(f"{target}: {shown}, {len(text.encode()) / 1e6:.2g} MB")
+    address = target.resolve().as_uri()
+    tell(f"open {address} in a browser")
+    if open_page:
+        webbrowser.open(address)
+
+
+def _surface(context: typer.Context, name: str, parameters: dict[str, Any], recipe: Recipe | None) -> Surface:
+    """Return the surface of one argument; the recipe is that of a scan, or of other settings."""
+    path, progress = Path(name), functools.partial(progress_bar, unit="%")
     if is_film(name):
         say(
             "note", f"{name}: the page shows the light that it reflects; `render` shows the light that a film transmits"
         )
-    text = page(surface, picture)
-    with whole_file(target) as temporary:
-        temporary.write_text(text, encoding="utf-8")
-    tell(f"{target}: {surface.spectrum.source}, {len(text.encode()) / 1e6:.2g} MB")
-    if open_page:
-        webbrowser.open(target.resolve().as_uri())
+    if recipe is None:
+        return Surface.named(name, parameters, progress)
+    spectrum = f"{path.stem}.exr"
+    extent = {"extent": recipe.settings.extent} if is_scan(name) else {}
+    options = _words(given_of(context, SCAN_OPTIONS) | extent)
+    command = shlex.join([NAME, "precompute", path.name, *options, "-o", spectrum])
+    return Surface.of_recipe(recipe, path.stem, {"filename": spectrum}, parameters, progress, command)
 
 
 def _words(options: dict[str, Any]) -> list[str]:

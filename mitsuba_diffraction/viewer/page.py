@@ -25,7 +25,7 @@ from .arrays import encoded
 from .coil import coil
 from .surface import AIR, DISCS, Surface
 
-MAX_BYTES = 6_000_000  # of a page
+MAX_BYTES = 6_000_000  # of a page of one surface
 MAX_HEIGHTS_SIDE = 512  # pixels of the heights for the shader of 2014
 
 SHORTEST_SHOWN = 380.0  # nm, of the wavelengths that a page shows
@@ -47,15 +47,16 @@ _SCRIPTS = (
 )
 
 
-def page(surface: Surface, picture: NDArray[np.float16] | None = None) -> str:
+def page(surface: Surface, *others: Surface, picture: NDArray[np.float16] | None = None) -> str:
     """Return the page of a surface as HTML.
 
     Args:
-        surface: what is shown.
-        picture: linear sRGB for comparison, (height, width, 3), the lowest row first.
+        surface: what is shown first.
+        others: what the page has beside it, in a list.
+        picture: linear sRGB for comparison with the first, (height, width, 3), the lowest row first.
 
     Raises:
-        RequestError: if it would be larger than `MAX_BYTES`, or the material is unknown.
+        RequestError: if that of one surface would be larger than `MAX_BYTES`, or two have one name.
     """
     text = (_ASSETS / "page.html").read_text(encoding="utf-8")
     shaders = {path.stem: path.read_text(encoding="utf-8") for path in sorted(_ASSETS.glob("*.glsl"))}
@@ -65,16 +66,23 @@ def page(surface: Surface, picture: NDArray[np.float16] | None = None) -> str:
         "styles": "\n".join((_ASSETS / name).read_text(encoding="utf-8") for name in _STYLES),
         "scripts": "\n".join((_ASSETS / name).read_text(encoding="utf-8") for name in _SCRIPTS),
         "shaders": _json(shaders),
-        "data": _json(_data(surface, picture)),
     }
+    names = [one.name for one in (surface, *others)]
+    if len(set(names)) < len(names):
+        raise RequestError(f"surfaces: got {', '.join(names)}, wanted each name once")
+    around = len(text.encode()) + sum(len(part.encode()) for part in parts.values())
+    data = []
+    for index, one in enumerate((surface, *others)):
+        data.append(_json(_data(one, picture if index == 0 else None)))
+        if (size := around + len(data[-1].encode())) > MAX_BYTES:
+            raise RequestError(
+                f"{one.name}: got a page of {size / 1e6:.3g} MB, wanted at most {MAX_BYTES / 1e6:g}; a larger "
+                "tolerance or a shorter coherence length makes its table smaller"
+            )
+    tags = (f'<script id="data{i or ""}" type="application/json">{one}</script>' for i, one in enumerate(data))
+    parts |= {"data": "\n".join(tags), "names": _json(names)}
     # In one pass, as a part may hold what looks like the name of another.
-    text = re.sub(r"\{\{(\w+)\}\}", lambda match: parts[match[1]], text)
-    if (size := len(text.encode())) > MAX_BYTES:
-        raise RequestError(
-            f"{surface.name}: got a page of {size / 1e6:.3g} MB, wanted at most {MAX_BYTES / 1e6:g}; a larger "
-            "tolerance or a shorter coherence length makes its table smaller"
-        )
-    return text
+    return re.sub(r"\{\{(\w+)\}\}", lambda match: parts[match[1]], text)
 
 
 def reference_picture(path: str | os.PathLike[str]) -> NDArray[np.float16]:

@@ -43,9 +43,9 @@ def opened(browser, tmp_path):
     """opened(surface, picture): its page, ready; the messages and requests of the page are collected in `messages`."""
     tabs = []
 
-    def of(surface, picture=None):
+    def of(surface, *others, picture=None):
         path = tmp_path / f"{len(tabs)}.html"
-        path.write_text(pages.page(surface, picture), encoding="utf-8")
+        path.write_text(pages.page(surface, *others, picture=picture), encoding="utf-8")
         tab = browser.new_page(viewport={"width": 420, "height": 400})
         tab.messages = []
         tab.on("console", lambda message: tab.messages.append(message.text))
@@ -277,6 +277,57 @@ def test_a_pixel_has_the_orders_of_the_grating_equation(opened):
     peak = max(picked["values"], key=lambda pair: pair[1])[0]
     assert min(abs(peak - wavelength) for wavelength in orders.values()) <= 4
     assert "Orders, by the grating equation" in tab.locator("#picked-text").inner_text()
+    labels = tab.locator("#plot text").all_text_contents()
+    assert labels[-1] == "wavelength in nm"
+    assert re.fullmatch(r"f cos θ up to [\d.e+]+ sr⁻¹", labels[-2])
+
+
+def test_a_colour_is_not_said_to_be_nothing(opened):
+    """At a pixel that only the sky lights, and at one that is black."""
+    tab = opened(Surface.named("blazed", {"period": 2.5, "depth": 0.25, "material": "none"}))
+    remarks = []
+    for sky in (0.5, 0):
+        state = f"lightAzimuth: 40, lightElevation: 20, lightWidth: 0, lightLength: 0, sky: {sky}"
+        tab.evaluate(f"viewer.set({{ maxFrames: 1, shape: 'plate', azimuth: -90, elevation: 60, {state} }})")
+        wait_for_frames(tab)
+        width, height = tab.evaluate("[viewer.renderer.width, viewer.renderer.height]")
+        picked = tab.evaluate("([x, y]) => viewer.picker.pick(x, y)", [width / 2, height / 2])
+        assert max(value for _, value in picked["values"]) < 1e-6
+        assert (max(picked["xyz"]) > 0) == (sky > 0)
+        remarks.append(tab.locator("#picked-text").inner_text())
+    assert "From the middle of the lamp nothing is diffracted to the eye; the colour is from the sky." in remarks[0]
+    assert "Nothing is diffracted from this light to the eye." in remarks[1]
+
+
+def test_what_is_shown_first_is_complete(opened):
+    """The bands of a slow first frame are not shown: a smaller picture stands there until the frame is complete."""
+    tab = opened(Surface.named("blazed", {"depth": 0.1, "samples": 64, "coherence_length": 3.0}))
+    tab.evaluate("viewer.set({ maxFrames: 4, sky: 1, shape: 'plate', azimuth: -90, elevation: 89, distance: 3 })")
+    # As of a device that draws one band in each turn.
+    tab.evaluate("viewer.renderer.model.milliseconds = 1e4")
+    seen = tab.evaluate(
+        """new Promise((done) => {
+          const { renderer } = viewer, canvas = document.getElementById('canvas'), seen = [];
+          const draw = renderer.draw.bind(renderer);
+          renderer.draw = (side, state, columns, budget) => {
+            draw(side, state, columns, Math.min(budget, budget === Infinity ? Infinity : 1e-3));
+          };
+          viewer.set({ exposure: 0.25 });
+          const look = () => {
+            const gl = canvas.getContext('webgl2'), found = new Uint8Array(4 * canvas.width * canvas.height);
+            gl.bindFramebuffer(gl.FRAMEBUFFER, null);
+            gl.readPixels(0, 0, canvas.width, canvas.height, gl.RGBA, gl.UNSIGNED_BYTE, found);
+            const at = (y) => found[4 * (Math.floor(y * canvas.height) * canvas.width + canvas.width / 2)];
+            seen.push([renderer.model.frame, renderer.model.row, at(0.3), at(0.7)]);
+            if (renderer.model.frame > 0 || seen.length > 400) done(seen);
+            else requestAnimationFrame(look);
+          };
+          requestAnimationFrame(() => requestAnimationFrame(look));
+        })"""
+    )
+    assert any(row > 0 for _, row, _, _ in seen)
+    for *_, low, high in seen:
+        assert low == pytest.approx(high, abs=16)
 
 
 @pytest.mark.parametrize(
@@ -394,13 +445,33 @@ def test_the_scene_of_a_disc_has_its_rings(disc, opened, tmp_path, llvm):
 def test_a_reference_picture_is_compared(opened):
     surface = Surface.named("blazed", {"depth": 0.1, "samples": 64, "coherence_length": 3.0})
     grey = np.full((40, 40, 3), 0.5, np.float16)
-    tab = opened(surface, grey)
+    tab = opened(surface, picture=grey)
     tab.evaluate("viewer.set({ maxFrames: 1, right: 'picture', exposure: 0 })")
     wait_for_frames(tab)
     shown = tab.locator("#right-name").inner_text()
     tab.evaluate("viewer.set({ difference: true })")
     assert shown == "reference"
     assert tab.locator("#legend").is_visible()
+    assert tab.messages == [tab.url[:80]]
+
+
+def test_a_list_of_surfaces_shows_each(disc, opened):
+    blaze = Surface.named("blazed", {"depth": 0.1, "samples": 64, "coherence_length": 3.0, "material": "Au"})
+    tab = opened(disc, blaze)
+    names = ["compact_disc", "blazed"]
+    assert tab.locator("#surface option").all_inner_texts() == names
+    pictures = []
+    # To and fro, and twice at once, of which the last counts.
+    for number in (0, 1, 0, [0, 1]):
+        for one in number if isinstance(number, list) else [number]:
+            tab.locator("#surface").select_option(str(one))
+        tab.evaluate("viewer.ready")
+        tab.evaluate("viewer.set({ maxFrames: 1 })")
+        wait_for_frames(tab)
+        assert tab.locator("#title").inner_text() == names[one]
+        assert tab.evaluate("[viewer.data.name, viewer.state.shape]") == [names[one], ("disc", "sphere")[one]]
+        pictures.append(tab.screenshot())
+    assert pictures[0] == pictures[2] != pictures[1] == pictures[3]
     assert tab.messages == [tab.url[:80]]
 
 

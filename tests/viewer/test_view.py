@@ -186,6 +186,25 @@ def test_a_disc_opens_under_plastic_with_its_tracks_round_the_centre(source, com
         assert first == pytest.approx(46 / 120, rel=0.02)
 
 
+def test_several_surfaces_are_a_list_in_one_page(command, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    np.save("scan.npy", 0.05 * np.random.default_rng(1).random((32, 32)))
+    scan = "scan.npy --pixel-size 0.1 --coherence-length 1.5 --unit um"
+    other = SMALL.replace("blazed", "lamellar,period=1")
+    code, out, error = command(f"view {SMALL},material=Al {other} {scan} --no-open")
+    assert code == 0, error
+    assert out.startswith("surfaces.html: 3 surfaces, ")
+    assert out.endswith(f"open {(tmp_path / 'surfaces.html').as_uri()} in a browser\n")
+    text = Path("surfaces.html").read_text(encoding="utf-8")
+    found = [
+        json.loads(data) for data in re.findall(r'<script id="data\d*" type="application/json">(.*)</script>', text)
+    ]
+    assert [data["name"] for data in found] == ["blazed", "lamellar", "scan"]
+    assert [data["material"]["material"] for data in found] == ["Al", "", ""]
+    code, _, error = command(f"view {SMALL} {SMALL},material=Al --no-open")
+    assert (code, error.partition("error: ")[2]) == (2, "surfaces: got blazed, blazed, wanted each name once\n")
+
+
 def test_a_coat_that_a_saved_spectrum_does_not_cover_is_refused(command, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     md.precompute(md.gratings.blazed(1.0, 0.02, samples=32), coherence_length=2).save("saved.exr")

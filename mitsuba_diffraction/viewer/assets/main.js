@@ -4,7 +4,8 @@ const MAX_FRAMES = 128;
 const EXPOSED_FRAMES = [1, 4, 16];  // after which the exposure is found, from less and less noise
 const BUDGET_MILLISECONDS = 80;  // of drawing between two turns of the page
 const LAMP_DISTANCE = 1.2;
-const BUSY_MILLISECONDS = 60;  // of a frame while dragging, above which fewer pixels are drawn
+const BUSY_MILLISECONDS = 60;  // of a frame, above which fewer pixels are drawn at first, and while dragging
+const PREVIEW_SCALE = 0.25;
 
 const shapeOf = (data) => (data.shape === "coil" && !data.coil ? "sphere" : data.shape);
 
@@ -42,8 +43,13 @@ function initialState(data) {
   };
 }
 
-function prepareControls(data) {
+function prepareControls(data, number) {
   const { spectrum } = data;
+  $("title").textContent = document.title = data.name;
+  $("of-surfaces").hidden = NAMES.length === 1;
+  for (const [i, name] of NAMES.entries()) $("surface").add(new Option(name, i));
+  $("surface").value = number;
+  $("surface").addEventListener("input", () => show(Number($("surface").value)));
   const options = [["dielectric", "dielectric"], ["none", "perfect mirror"], ...Object.keys(data.metals).map((m) => [m, m])];
   for (const [value, text] of options) $("material").add(new Option(text, value));
   // The vertices of the coil have no texture coordinates.
@@ -66,8 +72,18 @@ function prepareControls(data) {
   }
 }
 
-async function start() {
-  const data = JSON.parse($("data").textContent);
+const NAMES = JSON.parse($("names").textContent);
+const MAIN = document.querySelector("main").innerHTML;
+let stop = () => {};  // ends the view before
+let turn = 0;  // of starts, as the next may begin before the last is done
+
+// Shows the surface of this number in the list of the page.
+async function start(number = 0) {
+  stop();
+  stop = () => {};
+  const mine = ++turn;
+  document.querySelector("main").innerHTML = MAIN;
+  const data = JSON.parse($(`data${number || ""}`).textContent);
   window.SHADERS = JSON.parse($("shaders").textContent);
   const canvas = $("canvas");
   const gl = contextOf(canvas);
@@ -84,14 +100,15 @@ async function start() {
     coil: data.coil && (await coilOf(gl, data.coil)),
     picture: data.picture && (await pictureOf(gl, data.picture)),
   };
+  const heights = data.heights && [(await decoded(data.heights.values)).values, await tapersOf(data.heights)];
+  if (mine !== turn) return;
   const renderer = new Renderer(gl, data, tables);
-  const shader2014 = data.heights && new Shader2014(
-    gl, data.heights, (await decoded(data.heights.values)).values, await tapersOf(data.heights), renderer.spectrum);
+  const shader2014 = data.heights && new Shader2014(gl, data.heights, ...heights, renderer.spectrum);
   const state = initialState(data);
   let dirty = true;
   let exposed = { model: false, shader: false };
   let variant = "none";
-  prepareControls(data);
+  prepareControls(data, number);
   const controls = new Controls(state, () => { dirty = true; }, {
     auto: () => {
       exposed = { model: false, shader: false };
@@ -101,7 +118,7 @@ async function start() {
     reset: () => controls.set({ shape: shapeOf(data), ...firstView(data), exposure: 0 }),
     full: () => (document.fullscreenElement ? document.exitFullscreen() : $("stage").requestFullscreen()),
     save: () => {
-      renderer.drawScreen(state, background());  // what is not drawn now is no longer there
+      paint();  // what is not drawn now is no longer there
       canvas.toBlob((blob) => download(`${data.name}.png`, blob));
     },
   });
@@ -157,41 +174,75 @@ async function start() {
     exposed[name] = name === "shader" || side.frame === EXPOSED_FRAMES.at(-1);
   }
 
-  function draw() {
+  // A picture of fewer pixels is shown until the first frame is complete.
+  let held = false;
+  function paint() {
+    held &&= renderer.model.frame === 0;
+    if (!held) renderer.drawScreen(state, background());
+  }
+
+  function draw(budget = BUDGET_MILLISECONDS) {
     // The first frame of this model does not wait for a slow shader.
     const sides = renderer.model.frame === 0 ? [renderer.model] : renderer.sides;
     const busy = sides.filter((side) => side.frame < state.maxFrames);
     for (const side of busy) {
-      renderer.draw(side, state, region(side), BUDGET_MILLISECONDS / busy.length);
+      renderer.draw(side, state, region(side), budget / busy.length);
       expose(side, side === renderer.model ? "model" : "shader");
     }
-    renderer.drawScreen(state, background());
-    show(renderer, state);
+    paint();
+    showTimes(renderer, state);
   }
 
+  function preview() {
+    renderer.scale = PREVIEW_SCALE;
+    renderer.restart();
+    draw(Infinity);
+    renderer.scale = 1;
+    renderer.restart();
+    held = true;
+  }
+
+  let stopped = false;
   function tick() {
+    if (stopped) return;
     fit();
     prepared();
-    const slow = renderer.sides.some((side) => side.milliseconds > BUSY_MILLISECONDS || side.row > 0);
+    const slow = renderer.sides.some((side) => !(side.milliseconds <= BUSY_MILLISECONDS) || side.row > 0);
     if (controls.dragging && dirty && slow) renderer.scale = Math.max(renderer.scale / 2, 0.25);
     else if (!controls.dragging && renderer.scale < 1) {
       renderer.scale = 1;
       dirty = true;
     }
     if (dirty) {
-      renderer.restart();
       dirty = false;
-      draw();
+      if (slow && !controls.dragging) preview();
+      else {
+        held = false;
+        renderer.restart();
+        draw();
+      }
     } else if (renderer.sides.some((side) => side.frame < state.maxFrames)) draw();
     requestAnimationFrame(tick);
   }
 
   fit();
-  draw();
+  preview();
+  dirty = false;
   requestAnimationFrame(tick);
-  const redraw = () => renderer.drawScreen(state, background());
-  new ResizeObserver(() => { dirty = true; }).observe(canvas);
-  matchMedia("(prefers-color-scheme: dark)").addEventListener("change", redraw);
+  const redraw = () => {
+    if (!held) paint();
+    else dirty = true;
+  };
+  const resized = new ResizeObserver(() => { dirty = true; });
+  resized.observe(canvas);
+  const dark = matchMedia("(prefers-color-scheme: dark)");
+  dark.addEventListener("change", redraw);
+  stop = () => {
+    stopped = true;
+    resized.disconnect();
+    dark.removeEventListener("change", redraw);
+    gl.getExtension("WEBGL_lose_context")?.loseContext();
+  };
   const picker = new Picker(renderer, state);
   controls.pick = (x, y) => picker.pick(x, y);
   Object.assign(window.viewer, {
@@ -208,7 +259,7 @@ async function start() {
   });
 }
 
-function show(renderer, state) {
+function showTimes(renderer, state) {
   const of = (side) => (Number.isNaN(side.milliseconds) ? "…" : `${Number(side.milliseconds.toPrecision(3))} ms`);
   const drawing = Boolean(renderer.shader) && renderer.shader.frame === 0;
   $("drawing").hidden = !drawing;
@@ -243,10 +294,13 @@ async function pictureOf(gl, picture) {
 }
 
 window.viewer = {};
-window.viewer.ready = start().catch((error) => {
-  const text = error instanceof NotSupported ? error.message : `This page failed: ${error.message}`;
-  $("failure").textContent = text;
-  $("failure").hidden = false;
-  document.body.classList.add("failed");
-  if (!(error instanceof NotSupported)) throw error;
-});
+function show(number) {
+  window.viewer.ready = start(number).catch((error) => {
+    const text = error instanceof NotSupported ? error.message : `This page failed: ${error.message}`;
+    $("failure").textContent = text;
+    $("failure").hidden = false;
+    document.body.classList.add("failed");
+    if (!(error instanceof NotSupported)) throw error;
+  });
+}
+show(0);

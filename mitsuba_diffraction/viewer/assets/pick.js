@@ -82,12 +82,26 @@ class Picker {
     const digits = (v) => v.map((x) => x.toPrecision(3)).join(", ");
     $("picked-text").textContent = [
       `Light at ${angle(found.wi)}, eye at ${angle(found.wo)} from the normal.`,
-      Math.max(...values.map(([, value]) => value)) > DARK ? "" : "Nothing is diffracted from this light to the eye.",
+      this.remark(values, found.xyz[1]),
       named.length ? `Orders, by the grating equation: ${named.join("; ")}.` : "",
       `XYZ ${digits(found.xyz)}; linear sRGB ${digits(rgb)}.`,
     ].join(" ");
     this.plot(values, orders);
     return { ...found, values, orders, rgb };
+  }
+
+  // What a dark spectrum beside a colour means: it is that of the middle of the lamp alone.
+  remark(values, luminance) {
+    if (Math.max(...values.map(([, value]) => value)) > DARK) return "";
+    const { lightWidth, sky, coat } = this.state;
+    const others = [
+      ...(lightWidth > 0 ? ["other parts of the lamp"] : []),
+      ...(sky > 0 ? ["the sky"] : []),
+      ...(lightWidth > 0 && coat > 1 ? ["the image of the lamp in the clear layer"] : []),
+    ];
+    return luminance > DARK && others.length
+      ? `From the middle of the lamp nothing is diffracted to the eye; the colour is from ${others.join(" or ")}.`
+      : "Nothing is diffracted from this light to the eye.";
   }
 
   plot(values, orders) {
@@ -105,7 +119,8 @@ class Picker {
       .map(({ nanometres }) => make("line", { x1: x(nanometres), x2: x(nanometres), y1: 4, y2: 92, class: "mark" }));
     const axis = make("line", { x1: 0, x2: 280, y1: 92, y2: 92, class: "axis" });
     const labels = [400, 500, 600, 700].map((nm) => make("text", { x: x(nm), y: 106, "text-anchor": "middle" }, `${nm}`));
-    const top = make("text", { x: 2, y: 12 }, peak > DARK ? `${peak.toPrecision(3)} /sr` : "");
-    $("plot").replaceChildren(axis, ...marks, line, ...labels, top);
+    const top = make("text", { x: 2, y: 12 }, `f cos θ ${peak > DARK ? `up to ${peak.toPrecision(3)} sr⁻¹` : "in sr⁻¹: zero"}`);
+    const below = make("text", { x: 140, y: 120, "text-anchor": "middle" }, "wavelength in nm");
+    $("plot").replaceChildren(axis, ...marks, line, ...labels, top, below);
   }
 }
