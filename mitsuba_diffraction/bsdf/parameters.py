@@ -77,7 +77,7 @@ class Media:
         if kind not in TRANSMISSIONS:
             raise RequestError(f"transmission: got {kind!r}, wanted one of {', '.join(TRANSMISSIONS)}")
         if kind == "none":
-            densest = outside if coat is None else outside * max(coat.relative, _densest(coat.medium, coat.index))
+            densest = outside if coat is None else outside * coat.relative * _densest(coat.medium, coat.index)
             return cls(outside, coat, kind, None, densest)
         for name in ("material", "base", "coat_ior", "eta", "k"):
             if name in props:
@@ -95,6 +95,13 @@ class Media:
         """The maximum absolute index next to the relief, by which wavelengths are divided there."""
         return self.densest
 
+    @property
+    def index_name(self) -> str:
+        """The parameter that gives `index`."""
+        if self.coat is not None:
+            return "coat_ior"
+        return "int_ior" if self.eta is not None and self.eta > 1 else "ext_ior"
+
     def with_eta(self, eta: float) -> Media:
         """Return the media with another relative index of the material."""
         return replace(self, eta=eta, densest=self.outside * max(1.0, eta))
@@ -103,13 +110,6 @@ class Media:
 def _densest(medium: RefractiveIndex, nominal: float) -> float:
     """Return the maximum index of a medium at visible wavelengths relative to its nominal one."""
     return float(medium(np.linspace(*VISIBLE, 100) * 1e-3).real.max() / nominal)
-
-    @property
-    def index_name(self) -> str:
-        """The parameter that gives `index`."""
-        if self.coat is not None:
-            return "coat_ior"
-        return "int_ior" if self.eta is not None and self.eta > 1 else "ext_ior"
 
 
 class Scales:
