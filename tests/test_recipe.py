@@ -626,7 +626,7 @@ scan = "scan.npy"
 pixel_size = 0.05
 [spectrum]
 extent = "sample"
-coherence_length = 0.4
+coherence_length = 0.9
 tolerance = 0.05
 """
 
@@ -651,7 +651,7 @@ def test_a_command_reads_a_scan_once(tmp_path, command, monkeypatch, own_cache, 
         return read_height_field(path, **options)
 
     monkeypatch.chdir(tmp_path)
-    np.save("scan.npy", np.tile(np.sin(np.arange(24) * np.pi / 4) * 0.1, (20, 1)))
+    np.save("scan.npy", np.tile(np.sin(np.arange(64) * np.pi / 4) * 0.1, (60, 1)))
     write(tmp_path, SAMPLE, "scan.toml")
     grating = '<bsdf type="diffraction_grating"><string name="filename" value="scan.toml"/></bsdf>'
     shapes = 2 * f'<shape type="rectangle">{grating}</shape>'

@@ -9,7 +9,6 @@ import numpy as np
 from ..errors import RequestError, is_number
 from ..materials import (
     DISPERSION,
-    FILES,
     MAX_INDEX,
     MIN_INDEX,
     RefractiveIndex,
@@ -55,7 +54,8 @@ def index_from(name: str, index: float | str, absorbing: bool = False) -> Refrac
         return constant(_of_dielectric(index))
     except RuntimeError as error:
         known = str(error).partition("Valid choices are:")[2].strip()
-    wanted = f"a number, a file ({', '.join(FILES)}) or one of {', '.join(DISPERSION)}, {known}"
+    presets = [preset for preset in known.split(", ") if not is_dispersive(preset)]
+    wanted = f"a number, a file or one of {', '.join([*DISPERSION, *presets])}"
     if not absorbing:
         raise RequestError(f"{name}: got {index!r}, wanted {wanted}")
     try:
