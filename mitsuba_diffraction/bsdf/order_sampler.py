@@ -197,7 +197,8 @@ class OrderSampler:
         )
         first = np.clip(np.ceil(first.min(1)), -self.max_order, self.max_order).astype(np.int64)
         last = np.clip(np.floor(last.max(1)), -self.max_order, self.max_order).astype(np.int64)
-        return first + self.max_order, last - first + 1
+        # From inside of a medium beyond the critical angle of all orders, none.
+        return first + self.max_order, np.maximum(last - first + 1, 0)
 
     def _bin(self, incidence: Incidence, active: mi.Bool) -> tuple[mi.UInt32, mi.Int32, mi.Int32, mi.Int32, mi.Int32]:
         """Return the start of a bin in the table, its first order along x and y, its numbers of columns and rows."""
@@ -275,10 +276,10 @@ def cumulative_units(p: NDArray[np.float64], possible: NDArray[np.bool_]) -> NDA
     """Return cumulative sums of P_m in units of 2⁻²⁴, of which float32 has exact differences, beginning with zero.
 
     P_m is proportional to `p` among the `possible` orders, but for `UNIFORM_FRACTION`, which is divided equally among
-    them, and zero elsewhere: (..., orders) → (..., orders + 1).
+    them, and zero elsewhere: (..., orders) → (..., orders + 1). Where no order is possible, all sums are zero.
     """
     p = p * possible
     p = (1 - UNIFORM_FRACTION) * p / np.maximum(p.sum(axis=-1, keepdims=True), 1e-30)
-    p += UNIFORM_FRACTION * possible / possible.sum(axis=-1, keepdims=True)
-    sums = np.rint(PROBABILITY_UNITS * p.cumsum(axis=-1) / p.sum(axis=-1, keepdims=True))
+    p += UNIFORM_FRACTION * possible / np.maximum(possible.sum(axis=-1, keepdims=True), 1)
+    sums = np.rint(PROBABILITY_UNITS * p.cumsum(axis=-1) / np.maximum(p.sum(axis=-1, keepdims=True), 1e-30))
     return np.insert(sums, 0, 0, axis=-1)

@@ -307,6 +307,16 @@ def test_other_parameters_leave_tables_of_varying_scales(monkeypatch):
     parameters.update()
 
 
+def test_bins_in_which_no_order_propagates_are_empty():
+    """Inside glass, beyond the critical angle of all orders of a fine grating: 0/0 was no probability."""
+    bsdf = transmitting("interface", depth=1.0, lateral_scale=0.1, conserve_energy=False)
+    wi = testing.direction(80, 40) * [1, 1, -1]
+    _, weight, bs = testing.sample(bsdf, np.broadcast_to(wi, (1 << 12, 3)), [650.0] * 4)
+    assert np.isfinite(weight).all()
+    assert np.isfinite(np.array(bs.pdf)).all()
+    assert (np.array(bs.wo.z)[weight[:, 0] > 0] < 0).all()  # all light is totally reflected
+
+
 @pytest.mark.parametrize("kind", KINDS)
 def test_samples_have_their_component_and_index(kind):
     bsdf = transmitting(kind, conserve_energy=False)
