@@ -30,8 +30,8 @@ from .scene import channel_wavelengths, channel_weights, no_warnings, recorded_r
 Rows = tuple[int, int]
 """The first row of a band of a picture, and the row after its last."""
 
-# A band of this many pixels takes 1.3 GB.
-BAND_PIXELS = 2**19
+# A band of this many pixels takes 1.4 GB.
+BAND_PIXELS = 2**20
 _SPOOLED_BYTES = 2**22  # in memory for each band
 
 # Index of a pixel (row by row), mask → index of its first sample and one past its last; they are contiguous.
@@ -111,9 +111,9 @@ def needs_mitsubas_film(integrator: mi.Integrator) -> bool:
 def check_memory(scene: mi.Scene, spp: int, bands: tuple[Rows, ...] | None = None) -> int:
     """Check that a picture fits into the available memory, where the system reports it (Linux); return what it needs.
 
-    The peak memory is 24 n + 68 bytes per pixel of n channels of a band (sums in float64, the result of a pass and
-    copies of it, and the picture in float32), 40 bytes per sample of a pass of it (position on the film, channels and
-    values of four wavelengths), and 8 bytes per pixel of the film. With Mitsuba's film, 14 n and 24 n were measured.
+    The peak memory is 8 n + 84 bytes per pixel of n channels of a band (the sums and the result of a pass in float32,
+    and its luminance), 40 bytes per sample of a pass of it (position on the film, channels and values of four
+    wavelengths), and 8 bytes per pixel of the film. With Mitsuba's film, 14 n and 24 n were measured.
 
     Args:
         scene: from `load_spectral_scene`.
@@ -126,7 +126,7 @@ def check_memory(scene: mi.Scene, spp: int, bands: tuple[Rows, ...] | None = Non
     columns, rows = (int(size) for size in scene.sensors()[0].film().crop_size())
     largest = rows if bands is None else max(end - first for first, end in bands)
     n = channel_wavelengths(recorded_range(scene)).size
-    pixel_bytes, sample_bytes = (14 * n, 24 * n) if needs_mitsubas_film(scene.integrator()) else (24 * n + 68, 40)
+    pixel_bytes, sample_bytes = (14 * n, 24 * n) if needs_mitsubas_film(scene.integrator()) else (8 * n + 84, 40)
     needed = columns * (largest * (pixel_bytes + sample_bytes * spp) + 8 * rows)
     dr.flush_malloc_cache()
     if (available := _available_memory()) is not None and needed > available:
@@ -272,14 +272,20 @@ def _trace(
     # Rows above and below that are traced as well.
     radius = _radius(rfilter)
     margins = border, min(first + border, radius), min(film_rows + border - end, radius)
-    light = None
-    if hasattr(integrator, "parts"):
-        integrator, light = integrator.parts(scene, sensor)
     traced_columns, traced_rows = columns + 2 * border, end - first + sum(margins[1:])
-    light_seed, seed = seed, pass_seed(seed, first) if first else seed
+    shape, channels = (end - first, columns), channel_wavelengths(recorded_range(scene)).size
 
     sampler = sampler_of(sensor.sampler(), spp)
     spp = sampler.sample_count()
+    sums = None
+    if hasattr(integrator, "parts"):
+        integrator, light = integrator.parts(scene, sensor)
+        if light is not None:
+            # What Dr.Jit keeps of the last pass is larger than the contributions, which are in other memory.
+            dr.flush_malloc_cache()
+            splats = light_of_bands.of(rows, light, spp, seed, radius)
+            sums = _sums_of_light(film, splats, first, spp, shape, margins)
+    seed = pass_seed(seed, first) if first else seed
     sampler.set_samples_per_wavefront(spp)
     size = traced_columns * traced_rows * spp
     sampler.seed(seed, size)
@@ -299,21 +305,16 @@ def _trace(
     ray, weight = sensor.sample_ray_differential(time, sampler.next_1d(), on_film, aperture)
     ray.scale_differential(spp**-0.5)
     traced, valid, _ = integrator.sample(scene, sampler, ray, sensor.get_medium())
-    channels = channel_wavelengths(recorded_range(scene)).size
     channel, value = _on_channels(film, ray.wavelengths, weight * traced)
     covered = [dr.select(valid, mi.Float(1), 0)] if alpha else []
     dr.eval(position, channel, value, covered)
-    shape = end - first, columns
     collected = functools.partial(collect, rfilter, position, size=shape, margins=margins, samples=equal_ranges(count))
-    sums = np.array(collected(channel, value, channels=channels)).reshape(*shape, -1)
-    if light is not None:
-        splats = light_of_bands.of(rows, light, spp, light_seed, radius)
-        origin = np.array([0, first, *[0] * (splats.shape[1] - 2)], np.float32)
-        _add_light(sums, film, splats - origin, spp, margins)
+    # In the memory of Dr.Jit, without a copy.
+    traced = np.asarray(collected(channel, value, channels=channels, earlier=sums)).reshape(*shape, -1)
     if alpha:
         coverage = np.array(collected([dr.zeros(mi.Float, size)], covered, channels=1)).reshape(*shape, 2)
-        sums = np.concatenate([sums[..., :-1], coverage], axis=-1)
-    return sums
+        traced = np.concatenate([traced[..., :-1], coverage], axis=-1)
+    return traced
 
 
 def _on_channels(film: mi.Film, wavelengths: mi.Spectrum, value: mi.Spectrum) -> tuple[list[mi.Float], list[mi.Float]]:
@@ -328,30 +329,39 @@ def _on_channels(film: mi.Film, wavelengths: mi.Spectrum, value: mi.Spectrum) ->
     return list((wavelengths - float(centres[0])) / step), list(radiance / (len(radiance) * step))
 
 
-def _add_light(
-    sums: NDArray[np.float32], film: mi.Film, splats: NDArray[np.float32], spp: int, margins: tuple[int, int, int]
-) -> None:
-    """Add the contributions of paths from the light, without adding to the sums of filter weights.
+def _sums_of_light(
+    film: mi.Film,
+    splats: NDArray[np.float32],
+    first: int,
+    spp: int,
+    size: tuple[int, int],
+    margins: tuple[int, int, int],
+) -> mi.Float | None:
+    """Return the sums of the contributions of paths from the light, see `collect`; None if there are none.
 
-    They are sorted by pixel, and those of a pixel by the order of tracing. Their positions are relative to the first
-    row of the sums.
+    They are sorted by pixel, and those of a pixel by the order of tracing.
     """
     if not len(splats):
-        return
-    rows, columns, channels = sums.shape
+        return None
+    rows, columns = size
     _, above, below = margins
-    row = np.clip(np.floor(splats[:, 1]).astype(np.int64) + above, 0, rows + above + below - 1)
+    row = np.clip(np.floor(splats[:, 1] - np.float32(first)).astype(np.int64) + above, 0, rows + above + below - 1)
     pixel = row * columns + np.clip(splats[:, 0].astype(np.int64), 0, columns - 1)
     position, wavelengths, value = unpacked(splats[np.argsort(pixel, kind="stable")])
+    position.y -= dr.opaque(mi.Float, first)
     counts = np.bincount(pixel, minlength=(rows + above + below) * columns)
     starts = mi.UInt32(np.concatenate([[0], counts.cumsum()]))
     channel, value = _on_channels(film, wavelengths, value * dr.opaque(mi.Float, spp))
+    dr.eval(position, channel, value)
 
     def range_of_pixel(index: mi.UInt32, active: mi.Bool) -> tuple[mi.UInt32, mi.UInt32]:
         return dr.gather(mi.UInt32, starts, index, active), dr.gather(mi.UInt32, starts, index + 1, active)
 
-    added = collect(film.rfilter(), position, channel, value, (rows, columns), margins, range_of_pixel, channels - 1)
-    sums[..., :-1] += np.array(added).reshape(sums.shape)[..., :-1]
+    channels = channel_wavelengths(wavelengths_of(film)).size
+    sums = collect(film.rfilter(), position, channel, value, size, margins, range_of_pixel, channels)
+    # The contributions are not needed any more when the samples are traced.
+    dr.eval(sums)
+    return sums
 
 
 def equal_ranges(count: mi.UInt32) -> SampleRange:
@@ -374,12 +384,13 @@ def collect(
     margins: tuple[int, int, int],
     samples: SampleRange,
     channels: int,
+    earlier: mi.Float | None = None,
 ) -> mi.Float:
     """Gather the samples under the filter of each pixel, row by row, in one lane per pixel.
 
     `channel` and `value` are lists; the value at a fractional channel is divided linearly between the two nearest
     channels. The result has `channels` sums and then the sum of filter weights of each pixel. There are also samples in
-    the `margins`: pixels at each side, rows above and rows below.
+    the `margins`: pixels at each side, rows above and rows below. Those of the channels are added to `earlier` sums.
     """
     rows, columns = size
     sides, above, below = margins
@@ -391,7 +402,9 @@ def collect(
     y = mi.Int32(pixel // across)
     x = mi.Int32(pixel) - y * mi.Int32(across)
     base = pixel * (channels + 1)
-    sums = dr.zeros(mi.Float, rows * columns * (channels + 1))
+    sums = dr.zeros(mi.Float, rows * columns * (channels + 1)) if earlier is None else earlier
+    # Not a state of the loops, which would be copied.
+    add = functools.partial(dr.scatter_reduce, dr.ReduceOp.Add, sums, mode=dr.ReduceMode.NoConflicts)
     stride = mi.Int32(across) + 2 * sides
     last_x, first_y, last_y = mi.Int32(across) + sides, dr.opaque(mi.Int32, -above), dr.opaque(mi.Int32, rows + below)
 
@@ -416,9 +429,7 @@ def collect(
                 k = mi.Int32(lower)
                 for target, part in ((k, weighted * (1 - upper_weight)), (k + 1, weighted * upper_weight)):
                     exists = inside & (target >= 0) & (target < channels)
-                    dr.scatter_reduce(
-                        dr.ReduceOp.Add, sums, part, base + mi.UInt32(target), exists, dr.ReduceMode.NoConflicts
-                    )
+                    add(part, base + mi.UInt32(target), exists)
             weight += dr.select(inside, filter_weight, 0)
             index += 1
         tap += 1

@@ -1,7 +1,7 @@
 """Path tracing in passes, with the standard error of their sum and checkpoints of unfinished renderings.
 
 A checkpoint is an uncompressed `.npz` file (noise does not compress) with the fields of `Accumulation` and the `digest`
-of the request (`passes.Job`). Each field has a CRC-32. It takes 8 bytes per pixel and channel, and twice as much while
+of the request (`passes.Job`). Each field has a CRC-32. It takes 4 bytes per pixel and channel, and twice as much while
 it is being replaced.
 
 To bound memory, a large picture is traced in bands of rows (`film.bands_of`): in each pass, band after band is added to
@@ -76,7 +76,7 @@ class Accumulation:
     on their order: passes must be added in the order of their indices.
 
     Attributes:
-        sums: (height, width, n + 1) float64, or n + 2 with alpha: Σ_p of the results of `trace_pass`, at
+        sums: (height, width, n + 1) float32, or n + 2 with alpha: Σ_p of the results of `trace_pass`, at
             `channel_wavelengths(spectral_range)`.
         luminance: (height, width) float64, Σ_p n_p y_p.
         squares: (height, width) float64, Σ_p n_p y_p².
@@ -99,7 +99,7 @@ class Accumulation:
         """Return the sums of zero passes."""
         channels = channel_wavelengths(spectral_range).size + (2 if alpha else 1)
         luminance, squares = np.zeros((2, rows, columns))
-        return cls(np.zeros((rows, columns, channels)), luminance, squares, spectral_range=spectral_range)
+        return cls(np.zeros((rows, columns, channels), np.float32), luminance, squares, spectral_range=spectral_range)
 
     def add(self, traced: NDArray[np.float32], samples: int) -> None:
         """Add the result of `trace_pass` with that many samples per pixel."""
@@ -116,13 +116,12 @@ class Accumulation:
 
     def radiance(self, rows: slice = slice(None)) -> NDArray[np.float32]:
         """Return the radiance, (height, width, n) float32, W m⁻² sr⁻¹ nm⁻¹."""
-        # Row by row, to avoid a second copy of the sums of a large picture.
         n = channel_wavelengths(self.spectral_range).size
-        return np.stack([ratio(row[:, :n], row[:, -1:]).astype(np.float32) for row in self.sums[rows]])
+        return ratio(self.sums[rows, :, :n], self.sums[rows, :, -1:])
 
     def alpha(self) -> NDArray[np.float32]:
         """Return the fraction of valid samples, (height, width), 0 to 1; only of sums with alpha."""
-        return np.clip(ratio(self.sums[..., -2], self.sums[..., -1]), 0, 1).astype(np.float32)
+        return np.clip(ratio(self.sums[..., -2], self.sums[..., -1]), 0, 1)
 
     def relative_errors(self) -> NDArray[np.float32]:
         """Return the relative standard error of luminance, (height, width); NaN if black or before two passes.
@@ -284,7 +283,7 @@ class BandedSums:
 
 
 class BandedImage(SpectralImage):
-    """A picture of which one band is in memory at a time, as long as `radiance` is not read as a whole."""
+    """A picture that is read from its sums: of one band at a time, as long as `radiance` is not read as a whole."""
 
     _sums: BandedSums
 
@@ -309,7 +308,13 @@ class BandedImage(SpectralImage):
 
     @cached_property
     def radiance(self) -> NDArray[np.float32]:
-        return np.concatenate(list(self.blocks()))
+        radiance = np.empty(self.shape, np.float32)
+        row = 0
+        for block in self.blocks():
+            radiance[row : row + len(block)] = block
+            row += len(block)
+        radiance.setflags(write=False)
+        return radiance
 
 
 # Two million samples take some seconds on two cores, so that progress and interrupts are responsive. Passes of large
@@ -598,7 +603,7 @@ def _check_disk(job: Job, columns: int, checkpoint: str | os.PathLike[str] | Non
     paths = [] if checkpoint is None else [Path(checkpoint_of_band(checkpoint, band)) for band in range(len(bands))]
     folder = paths[0].absolute().parent if paths else Path(tempfile.gettempdir())
     rows = [end - first for first, end in bands]
-    needed = 8 * columns * (channel_wavelengths(job.spectral_range).size + 3) * (sum(rows) + max(rows))
+    needed = 4 * columns * (channel_wavelengths(job.spectral_range).size + 6) * (sum(rows) + max(rows))
     available = shutil.disk_usage(folder).free + sum(path.stat().st_size for path in paths if path.is_file())
     if needed > available:
         raise RequestError(
@@ -621,9 +626,7 @@ def _image(sums: BandedSums, job: Job, scene: str, complete: bool) -> SpectralIm
         attributes["error"] = error_of_picture(sums.errors)
     if complete:
         attributes["digest"] = job.digest()
-    if len(job.bands) > 1:
-        return BandedImage(sums, attributes)
-    return SpectralImage(channel_wavelengths(job.spectral_range), sums.band(0).radiance(), attributes, sums.alpha)
+    return BandedImage(sums, attributes)
 
 
 def _warn_of_implausible_pixels(luminance: NDArray[np.float32], limit: float) -> None:

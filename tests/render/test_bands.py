@@ -240,7 +240,6 @@ def test_the_error_of_bands_is_that_of_the_whole_picture(three_bands, small_pass
     banded = render(write_scene(), spp=64, until_error=0.2)
     monkeypatch.setattr(film, "BAND_PIXELS", 1000)
     whole = render("scene.xml", spp=64, until_error=0.2)
-    assert not isinstance(whole, BandedImage)
     assert banded.attributes["error"] <= 0.2
     assert banded.attributes["spp"] < 64
     assert banded.attributes["spp"] == pytest.approx(whole.attributes["spp"], rel=0.4)
@@ -249,8 +248,8 @@ def test_the_error_of_bands_is_that_of_the_whole_picture(three_bands, small_pass
 def test_checkpoints_that_do_not_fit_on_the_disk_are_refused(three_bands, monkeypatch):
     monkeypatch.setattr(passes, "trace_pass", None)
     usage = passes.shutil.disk_usage(".")
-    monkeypatch.setattr(passes.shutil, "disk_usage", lambda folder: usage._replace(free=10**5))
-    words = r"12 × 10 pixels, whose checkpoints take 0\.000129 GB of the disk, wanted at most the 0\.0001 GB"
+    monkeypatch.setattr(passes.shutil, "disk_usage", lambda folder: usage._replace(free=10**4))
+    words = r"12 × 10 pixels, whose checkpoints take 6\.65e-05 GB of the disk, wanted at most the 1e-05 GB"
     with pytest.raises(ValueError, match=words):
         render(write_scene(), spp=4, checkpoint="c")
 
@@ -264,8 +263,8 @@ def test_what_a_rendering_needs_is_announced_after_two_bands(three_bands, small_
     render(write_scene(), spp=6, announce=estimates.append)
     (estimate,) = estimates
     assert (estimate.columns, estimate.rows, estimate.spp) == (12, 10, 6)
-    assert estimate.memory == 12 * (4 * (24 * 93 + 68 + 40) + 80)
-    assert estimate.disk == 12 * 14 * (93 + 3) * 8  # one of four rows is written anew while the old one is there
+    assert estimate.memory == 12 * (4 * (8 * 93 + 84 + 40) + 80)
+    assert estimate.disk == 12 * 14 * (93 + 6) * 4  # one of four rows is written anew while the old one is there
     assert estimate.seconds == 160  # for 16 more
 
 
