@@ -2,11 +2,13 @@
 
 from pathlib import Path
 
+import colour
 import numpy as np
 import pytest
 
 import mitsuba_diffraction as md
 from mitsuba_diffraction.inverse_design import Design, Verdict
+from mitsuba_diffraction.inverse_design.build import WHITE
 from mitsuba_diffraction.inverse_design.far_field import nearest_levels
 from mitsuba_diffraction.inverse_design.output import save
 from mitsuba_diffraction.inverse_design.plate import Plate
@@ -184,7 +186,7 @@ def test_white_light_is_directed_at_all_wavelengths():
     assert between.min() > 0.95 * found.efficiency.min()
 
 
-def unsearched(wavelengths, **options):
+def unsearched(wavelengths, target=None, **options):
     """A design of random heights."""
     plate = Plate(
         **{"texel": 1.0, "texels": 12, "height_range": 0.8, "angle": 17.5, "tool_blur": 0.13, **options},
@@ -192,7 +194,8 @@ def unsearched(wavelengths, **options):
         **{"int_ior": None, "levels": None},
     )
     heights = np.random.default_rng(0).uniform(0, plate.height_range, 2 * (plate.texels,))
-    return Design.of(heights, plate, wanted_fractions(lopsided(), plate))
+    wanted = wanted_fractions(lopsided() if target is None else target, plate)
+    return Design.of(heights, plate, wanted[..., ::-1] if plate.mirrored else wanted)
 
 
 def test_a_design_in_infrared_is_that_of_shorter_light_in_larger_lengths():
@@ -212,6 +215,34 @@ def test_the_recipe_of_a_deep_relief_for_infrared_light_is_accepted(tmp_path):
     recipe = Recipe.load(tmp_path / "plate.toml")
     assert recipe.settings.wavelengths[0] < 10600 < recipe.settings.wavelengths[1]
     assert recipe.settings.largest_height_range > np.ptp(design.height_field.heights) > 20
+
+
+@pytest.mark.parametrize("unused", ["outside", "mirror"])
+def test_the_target_has_the_colours_of_the_picture_and_the_prediction_those_of_its_light(unused):
+    encoded = np.zeros((24, 24, 3))
+    encoded[4:20, 3:11], encoded[4:20, 13:21] = (1, 0, 0), (0, 80 / 255, 1)
+    picture = colour.cctf_decoding(encoded, function="sRGB")
+    design = unsearched(WHITE, picture, texels=20, unused=unused)
+    target, predicted = (image[::-1] for image in design.seen)  # rows from the top
+    size = len(target)
+    red, blue = (target[size // 2, int(size * x)] for x in (7 / 24, 17 / 24))
+    for found, wanted in ((red, picture[12, 7]), (blue, picture[12, 17])):
+        pair = [colour.XYZ_to_Lab(colour.RGB_to_XYZ(np.clip(rgb, 0, None), "sRGB")) for rgb in (found, wanted)]
+        assert colour.delta_E(*pair, method="CIE 2000") < 3
+    # Its own light, integrated by colour-science in the light of D65, which is white.
+    shape = colour.SpectralShape(430, 670, 1)
+    daylight = colour.SDS_ILLUMINANTS["D65"].copy().align(shape)
+    row, column = size // 3, size // 3
+    light = design.predicted[:, ::-1, ::-1][:, row, column]
+    spectrum = np.interp(shape.range(), np.sort(WHITE), light[np.argsort(WHITE)]) * daylight.values
+    cmfs = colour.MSDS_CMFS["CIE 1931 2 Degree Standard Observer"].copy().align(shape)
+    rgb, lamp = (
+        colour.XYZ_to_RGB(values @ cmfs.values, "sRGB", apply_cctf_encoding=False)
+        for values in (spectrum, daylight.values)
+    )
+    ratio = predicted[row, column] / (rgb / lamp)
+    assert ratio == pytest.approx(ratio.mean(), rel=0.02)
+    assert design.colour_difference > 5
 
 
 @pytest.mark.parametrize(
