@@ -157,6 +157,10 @@ class Model:
                 amplitude = (np.exp(1j * np.outer(kappa, heights[0])) * of_x).sum(-1)
             elif columns == 1:
                 amplitude = (np.exp(1j * np.outer(kappa, heights[:, 0])) * of_y).sum(-1)
+            elif self.c.surface.kind == "crossed":  # h(x, y) = f(x) + g(y)
+                along_x, along_y = heights[0] - heights[0, 0], heights[:, 0]
+                amplitude = (np.exp(1j * np.outer(kappa, along_x)) * of_x).sum(-1)
+                amplitude = amplitude * (np.exp(1j * np.outer(kappa, along_y)) * of_y).sum(-1)
             else:
                 amplitude = np.array(
                     [y @ (np.exp(1j * k * heights) @ x) for x, y, k in zip(of_x, of_y, kappa, strict=True)]
