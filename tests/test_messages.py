@@ -168,5 +168,6 @@ def test_a_scene_sets_the_tolerance_of_a_recipe(tmp_path, llvm):
 @pytest.mark.slow
 def test_every_material_of_mitsuba_is_known(llvm):
     for material in ("Al", "Au", "none", "Cr", "a-C", "TiO2_palik"):
-        mi.load_dict({"type": "diffraction_grating", "profile": "blazed", "period": 2.5, "depth": 0.25,
-                      "tolerance": 0.05, "coherence_length": 5.0, "material": material})  # fmt: skip
+        bsdf = mi.load_dict({"type": "diffraction_grating", "profile": "blazed", "period": 2.5, "depth": 0.25,
+                             "tolerance": 0.05, "coherence_length": 5.0, "material": material})  # fmt: skip
+        assert f"reflectance = {'none (R = 1)' if material == 'none' else f'conductor, {material}'}" in str(bsdf)

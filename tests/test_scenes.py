@@ -90,13 +90,15 @@ import mitsuba_diffraction
 import mitsuba as mi
 mi.set_variant("llvm_ad_spectral")
 mi.Bitmap(mi.Bitmap.PixelFormat.Y, mi.Struct.Type.Float16, [4, 2]).write("texture.exr")
-mi.load_dict({"type": "bitmap", "filename": "texture.exr"})
+print(mi.traverse(mi.load_dict({"type": "bitmap", "filename": "texture.exr"}))["data"].shape)
 """
 
 
 @pytest.mark.skipif(not hasattr(os, "sched_setaffinity"), reason="the system cannot confine a process to one core")
 def test_a_picture_is_a_texture_on_one_core(llvm, tmp_path):
-    subprocess.run([sys.executable, "-c", ON_ONE_CORE], cwd=tmp_path, check=True, timeout=60)
+    program = [sys.executable, "-c", ON_ONE_CORE]
+    done = subprocess.run(program, cwd=tmp_path, check=True, timeout=60, capture_output=True, text=True)
+    assert done.stdout.endswith("(2, 4, 1)\n")
 
 
 # ---------------------------------------------------------------- scenes with models

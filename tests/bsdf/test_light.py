@@ -6,6 +6,7 @@ import pytest
 from bsdf_support import albedo, direction, plugin
 
 import mitsuba_diffraction as md
+from mitsuba_diffraction.bsdf.base import gratings_in
 from mitsuba_diffraction.settings import Settings
 
 WAVELENGTHS = (450.0, 530.0, 600.0, 700.0)
@@ -97,7 +98,10 @@ def test_a_rigorous_spectrum_is_refused_outside_its_wavelengths(llvm):
 def test_wavelengths_without_light_need_no_table(llvm):
     line = {"type": "regular", "wavelength_min": 530.0, "wavelength_max": 534.0, "values": "1, 1"}
     grating = {"type": "diffraction_grating", "spectrum": spectrum(500, 600)}
-    mi.load_dict(scene(grating, light=line))
+    loaded = mi.load_dict(scene(grating, light=line))
+    (bsdf,) = {bsdf for shape in loaded.shapes() for bsdf in gratings_in(shape.bsdf())}
+    shortest, longest = bsdf.layers.grating.theory.light
+    assert 500 <= shortest <= 530 < 534 <= longest <= 600
 
 
 @pytest.mark.parametrize("change", ["another sensor", "another light"])

@@ -314,7 +314,9 @@ def test_the_mask_ignores_scale_offset_and_missing_pixels():
 
 @pytest.mark.parametrize("shape", [(1, 1), (1, 60), (60, 1), (2, 3)])
 def test_a_mask_of_a_profile_or_of_few_pixels_is_no_error(shape):
-    prepare.mask_outliers(HeightField(np.zeros(shape), PIXEL))
+    masked = prepare.mask_outliers(HeightField(np.zeros(shape), PIXEL))
+    assert masked.shape == shape
+    assert not masked.gaps.any()
 
 
 # ---------------------------------------------------------------- rotation
