@@ -138,7 +138,8 @@ def value_is_that_of_the_model(case: Case):
         relative = relative + 3e-6 / (wavelength * model.sigma_q) + 2e-6 / cos**2 + 2e-6 / wi[2] ** 2
         enlarged = np.where(crosses, np.maximum(kappa, 1e-9), 1)
         enlarged = np.where(crosses, np.maximum(1, 0.25 * small / enlarged) ** 2, 1)
-        error = relative * (expected + base) + tolerance * slack / enlarged + 1e-6
+        floor = 1e-7 / (2 * np.pi * model.sigma_q**2 * wavelength**2)
+        error = relative * (expected + base) + tolerance * slack / enlarged + floor
         worst = np.argmax((got - expected - base) / error)
         note = dict(wi=wi, wavelength=wavelength[0], below=below)
         case.require(
