@@ -123,7 +123,7 @@ FIGURES = (
     ),
     Figure(("terms.png",), "mitsuba-diffraction benchmark --terms --plot {out}/terms.png", 10),
     Figure(("published_snakes.png",), "python docs/thesis/published_snakes.py {out}/published_snakes.png", 3),
-    Figure(("thin_film.png",), "python docs/thin_film.py {out}/thin_film.png"),
+    Figure(("thin_film.png", "film_stack.png"), "python docs/thin_film.py {out}/thin_film.png {out}/film_stack.png"),
     Figure(("fourier_images.png", "interpolation.png"), "python docs/thesis/fourier_figures.py {out}"),
     Figure(("published_heights.png", "published_maps.png"), "python docs/thesis/published_maps.py {out}", 8),
     Figure(

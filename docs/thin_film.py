@@ -1,8 +1,9 @@
-"""Figure of docs/plugin.md: efficiencies of a hologram with films, and reflectances of anodised titanium.
+"""Figures of docs/plugin.md: a hologram with films, anodised titanium, and the stack of films of a jewel beetle.
 
-python docs/thin_film.py docs/thin_film.png
+python docs/thin_film.py docs/thin_film.png docs/film_stack.png
 
-Curves are those of the plugin, at the centres of lobes; points those of closed forms, J_m² K with R by the package tmm.
+Curves and colours are those of the plugin, at the centres of lobes; points those of closed forms, J_m² K with R by the
+package tmm, and lines contours of R by tmm.
 """
 
 from __future__ import annotations
@@ -16,6 +17,8 @@ import mitsuba_diffraction as md  # before Dr.Jit
 import mitsuba as mi  # isort: skip
 import numpy as np
 import tmm
+from matplotlib.axes import Axes
+from matplotlib.collections import QuadMesh
 from numpy.typing import NDArray
 from scipy.special import jv
 
@@ -29,20 +32,25 @@ PERIOD, DEPTH, PLASTIC, SULPHIDE, OXIDE = 1.5, 0.1667, 1.5, 2.35, 2.4  # µm; in
 FILMS = {0.02: "#c6dbef", 0.04: "#9ecae1", 0.08: "#2171b5", 0.16: "#08306b"}  # µm, with colours
 OXIDES = {0.0: "0.5", 0.02: "#b8860b", 0.05: "#1f4e9c", 0.12: "#e0a000", 0.16: "#a030a0", 0.2: "#20908c"}
 WAVELENGTHS = np.linspace(0.38, 0.78, 101)  # µm
+# Stavenga, Wilts, Leertouwer and Hariyama 2011: indices of the layers from the outside in; number of layers and
+# measured peak (µm) of the green elytra and of their purple stripes. Below them is chitin, n = 1.517 + 8.8e-3 µm²/λ².
+LAYERS, PARTS = (1.7, 1.6), {"green": (16, 0.53), "purple stripe": (12, 0.7)}
+ANGLES = np.linspace(0, 75, 31)  # degrees
 
 
-def efficiencies(spectrum: md.GratingSpectrum, order: int, **parameters: Any) -> Array:
-    """Return the efficiency of an order at normal incidence, of the plugin inside its coat, at `WAVELENGTHS`."""
+def efficiencies(spectrum: md.GratingSpectrum, order: int, angle: float = 0.0, **parameters: Any) -> Array:
+    """Return the efficiency of an order at an angle of incidence, of the plugin inside its coat, at `WAVELENGTHS`."""
     bsdf = mi.load_dict({"type": "diffraction_grating", "spectrum": spectrum, "conserve_energy": False, **parameters})
     index = parameters.get("coat_ior", 1.0)
-    x = -order * WAVELENGTHS / PERIOD
+    incident = [np.sin(np.deg2rad(angle)), 0, np.cos(np.deg2rad(angle))]
+    x = -incident[0] - order * WAVELENGTHS / PERIOD
     wo = np.stack([x, 0 * x, np.sqrt(1 - x**2)], -1)
     wavelengths = np.repeat(1e3 * WAVELENGTHS[:, None], 4, axis=1)
-    value = evaluate_pdf(bsdf, np.broadcast_to([0, 0, 1.0], wo.shape), wo, wavelengths)[0][:, 0]
+    value = evaluate_pdf(bsdf, np.broadcast_to(incident, wo.shape), wo, wavelengths)[0][:, 0]
     # The peak of a lobe is n_o² η cos θ_o/(2π σ_q² λ²).
     faces = np.ones_like(x)
     if index > 1:
-        faces = transmitted(np.zeros_like(x), index) * transmitted(np.arcsin(-x), index)
+        faces = transmitted(np.arcsin(incident[0] + 0 * x), index) * transmitted(np.arcsin(-x), index)
     return value * WAVELENGTHS**2 * 2 * np.pi * lobe_width(spectrum.coherence_length) ** 2 / wo[:, 2] / faces
 
 
@@ -67,8 +75,37 @@ def expected(order: int, film: float) -> Array:
     return jv(order, kappa * DEPTH / 2) ** 2 * k * r
 
 
-def main(output: Path) -> None:
-    """Draw the figure."""
+def beetle(panel: Axes, plane: md.GratingSpectrum, part: str) -> QuadMesh:
+    """Draw R of the quarter-wave layers of a part of a beetle over wavelength and angle; return the map of colours."""
+    count, peak = PARTS[part]
+    thicknesses = [peak / (4 * n) for n in LAYERS]
+    repeated = [f"{count // 2} x ({', '.join(f'{x:.6g}' for x in pair)})" for pair in (LAYERS, thicknesses)]
+    stack = {"int_ior": "chitin", "thin_film_ior": repeated[0], "thin_film_thickness": repeated[1]}
+    found = np.array([efficiencies(plane, 0, angle, shadowing="none", **stack) for angle in ANGLES])
+    layers, depths = list(LAYERS) * (count // 2), [np.inf, *thicknesses * (count // 2), np.inf]
+    r = np.array(
+        [
+            [
+                np.mean([tmm.coh_tmm(p, [1, *layers, 1.517 + 8.8e-3 / w**2], depths, a, w)["R"] for p in "sp"])
+                for w in WAVELENGTHS
+            ]
+            for a in np.deg2rad(ANGLES)
+        ]
+    )
+    print(f"{part}: largest difference {np.abs(found - r).max():.1e}")
+    above = 1e3 * WAVELENGTHS[r[0] > r[0].max() / 2]
+    print(f"{part}: maximum {100 * r[0].max():.0f} %, more than half of it from {above[0]:.0f} to {above[-1]:.0f} nm")
+    grid = 1e3 * WAVELENGTHS, ANGLES
+    colours = panel.pcolormesh(*grid, 100 * found, vmin=0, vmax=50, cmap="magma", shading="gouraud", rasterized=True)
+    panel.contour(*grid, 100 * r, [10, 20, 30, 40], colors="w", linewidths=0.8, linestyles="dashed")
+    panel.axvline(1e3 * peak, color="w", linewidth=0.8, linestyle="dotted")
+    panel.set_title(f"{part}: {count} layers, published peak {1e3 * peak:.0f} nm", fontsize=9)
+    panel.set_xlabel("wavelength (nm)")
+    return colours
+
+
+def main(output: Path, of_stack: Path) -> None:
+    """Draw the figures."""
     mi.set_variant("llvm_ad_spectral")
     drawn = figure(9.5, 3.4)
     panels = drawn.subplots(1, 3)
@@ -93,9 +130,17 @@ def main(output: Path) -> None:
         panel.legend(fontsize=7)
     panels[0].set_ylabel("efficiency (%)")
     save_png(drawn, output)
+    drawn = figure(9.5, 3.4)
+    panels = drawn.subplots(1, 2, sharey=True)
+    for panel, part in zip(panels, PARTS, strict=True):
+        colours = beetle(panel, plane, part)
+    panels[0].set_ylabel("angle of incidence (degrees)")
+    drawn.colorbar(colours, ax=panels, label="reflectance (%)")
+    save_png(drawn, of_stack)
 
 
 if __name__ == "__main__":
     parser = argparse.ArgumentParser(description=(__doc__ or "").split("\n")[0])
     parser.add_argument("output", type=Path)
-    main(parser.parse_args().output)
+    parser.add_argument("of_stack", type=Path)
+    main(**vars(parser.parse_args()))
