@@ -92,7 +92,7 @@ def spectrum_to_XYZ(radiance: ArrayLike, wavelengths: ArrayLike) -> NDArray[np.f
 def spectrum_to_linear_sRGB(radiance: ArrayLike, wavelengths: ArrayLike) -> NDArray[np.float64]:
     """Compute linear sRGB of spectra, (..., n) → (..., 3). Colours outside the gamut have negative components.
 
-    Arguments and errors are those of `spectrum_to_XYZ`.
+    For arguments and errors see `spectrum_to_XYZ`.
     """
     return XYZ_to_linear_sRGB(spectrum_to_XYZ(radiance, wavelengths))
 
@@ -271,8 +271,8 @@ def plain_view(rgb: NDArray[np.floating]) -> NDArray[np.floating]:
 def ocio_view(name: str) -> View:
     """Return a view of OpenColorIO for its default display, such as the filmic curve of ACES.
 
-    The configuration is that of $OCIO, or else the one built into OpenColorIO (ACES for computer graphics). Colours
-    enter as XYZ relative to D65, by the role `cie_xyz_d65_interchange`.
+    The configuration comes from $OCIO. Without $OCIO it is the one built into OpenColorIO (ACES for computer graphics).
+    Colours enter as XYZ relative to D65, by the role `cie_xyz_d65_interchange`.
 
     Args:
         name: of the view, or the beginning of it, in upper or lower case.

@@ -199,9 +199,9 @@ def efficiencies(
 
         sin θ_i + n_o sin θ_m = m λ/T    (azimuth 0).
 
-    In scalar theory the efficiencies are those of the BSDF in the limit of narrow lobes, R K G E η_m(κ_m) or
-    K_t G_t (1 − F) E η_m(κ_m), in float64 without tables (`scalar_theory`); in rigorous theory they are those of
-    Maxwell's equations (`rigorous.efficiencies`).
+    Scalar theory: the efficiencies are the limit of the BSDF for narrow lobes, R K G E η_m(κ_m) or K_t G_t (1 − F) E
+    η_m(κ_m), in float64 without tables (`scalar_theory`). Rigorous theory: they follow from Maxwell's equations
+    (`rigorous.efficiencies`).
 
     Args:
         height_field: one period of a periodic surface; for rigorous theory a profile, h(x).

@@ -31,7 +31,10 @@ def is_bug(kind: type[BaseException]) -> bool:
 
 
 def is_number(value: object) -> bool:
-    """Return whether a parameter is a number that a float can hold: True, False, infinity and NaN are none."""
+    """Return whether a parameter is a number that a float can hold.
+
+    Booleans, infinity and NaN do not count as numbers.
+    """
     if not isinstance(value, Real) or isinstance(value, bool):
         return False
     size: Any = abs(value)  # numbers of any kind can be compared

@@ -23,7 +23,7 @@ SHADOWING = ("v_cavity", "none")
 HORIZON_GAIN = (-0.04034151, 0.81494507, -5.03522703, 10.57318562, -9.23048089, 3.5662365)
 
 Array = Any
-"""An array of NumPy or of Dr.Jit, as `select` is of one or the other."""
+"""A NumPy or Dr.Jit array, whichever `select` works on."""
 
 
 def k_g(
@@ -101,7 +101,7 @@ def diffracted(
         tangent: k_i,∥, (2,); nothing propagates if it is evanescent.
         steps: λq, (..., 2).
         n_i: index of the medium of ω_i.
-        n_o: of that of transmitted light; None for reflected light.
+        n_o: index of the medium of transmitted light; None for reflected light.
     """
     reflects, n_o = n_o is None, n_i if n_o is None else n_o
     square_i, excess = float(n_i**2 - tangent @ tangent), n_i**2 - n_o**2

@@ -55,7 +55,7 @@ class GratingSpectrum(PowerSpectrum):
 
     Attributes:
         energy: the table of E, if read from the file; otherwise `energy_table` computes it.
-        waves: those of the surface of a recipe, from which the error of scalar theory is estimated.
+        waves: the waves of a recipe's surface, from which the error of scalar theory is estimated.
     """
 
     energy: EnergyTable | None = field(default=None, repr=False)

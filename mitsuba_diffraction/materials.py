@@ -1,7 +1,7 @@
 """Refractive indices n + ik: numbers, names, and tables from files.
 
-Names of conductors are those of Mitsuba's `conductor` and of this package's `data/ior`; their tables are read without
-loading Mitsuba. Names of transparent media are those of `DISPERSION`, formulas n(λ) from the literature.
+Conductors have the names of Mitsuba's `conductor` and of this package's `data/ior`; their tables are read without
+loading Mitsuba. Transparent media have the names of `DISPERSION`, formulas n(λ) from the literature.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ from .settings import VISIBLE
 MIN_INDEX, MAX_INDEX = 0.01, 100.0
 FILES = (".spd", ".csv", ".yml")
 NOMINAL_WAVELENGTH = float(np.sqrt(VISIBLE[0] * VISIBLE[1])) * 1e-3
-"""µm, in the middle of visible light: where one number stands for a medium with dispersion, it is that of this λ."""
+"""µm, in the middle of visible light. Where one number stands for a medium with dispersion, it is n at this λ."""
 _OWN = Path(__file__).parent / "data" / "ior"
 _SYMBOLS = {
     **{"aluminium": "Al", "aluminum": "Al", "beryllium": "Be", "chrome": "Cr", "chromium": "Cr", "copper": "Cu"},
@@ -32,7 +32,7 @@ _SYMBOLS = {
     **{"rhodium": "Rh", "silver": "Ag", "tantalum": "Ta", "titanium": "Ti", "tungsten": "W", "vanadium": "V"},
 }
 
-# Name: formula, its coefficients (λ in µm), range in µm, source; the formulas are those of `_formula`.
+# Name: formula, its coefficients (λ in µm), range in µm, source; for the formulas see `_formula`.
 DISPERSION: dict[str, tuple[int, tuple[float, ...], tuple[float, float], str]] = {
     "BK7": (
         2,
@@ -230,7 +230,7 @@ def _medium(name: str) -> RefractiveIndex | None:
 
 
 def _near(name: str, known: list[str]) -> list[str]:
-    """Return the names in `known` that may be meant: those of the same element or beginning, or of similar spelling."""
+    """Return the names in `known` that may be meant: of the same element or beginning, or spelt similarly."""
     lower = name.lower()
     if lower in _SYMBOLS:
         return [other for other in known if other.partition("_")[0] == _SYMBOLS[lower]]

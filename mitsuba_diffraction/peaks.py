@@ -68,13 +68,13 @@ def peak_efficiencies(
     """Compute how much light the peaks of the spectrum of an irregular surface reflect, in air.
 
     The BRDF R K G E S(q; κ)/λ² is integrated over each peak, with du dv = λ² dq, and with E at the centre of the peak.
-    Directions are those of `efficiencies`.
+    For directions see `efficiencies`.
 
     Args:
         spectrum: of a sample, or of a tile whose orders overlap.
         angles: of incidence, degrees, one or (a,), above −90 and below 90.
         wavelengths: nm, one or (w,), for which the spectrum was built.
-        material: as of `efficiencies`.
+        material: see `efficiencies`.
         int_ior: likewise.
         azimuth: likewise.
         progress: called with (steps done, steps in all).

@@ -53,7 +53,7 @@ def precompute(
         progress: called with (steps done, steps in all). An interrupted build of rigorous theory resumes from
             intermediate results in the cache folder.
 
-    All other arguments are those of `Settings`.
+    For all other arguments see `Settings`.
 
     Returns:
         The spectrum; its `error` is measured at values of κ that were not used to build it.
@@ -129,7 +129,7 @@ def load_spectrum(path: str | os.PathLike[str], recipe: str | None = None) -> Sp
 
 
 def is_rigorous(path: str | os.PathLike[str]) -> bool:
-    """Return whether a file exists and its header is that of a rigorous spectrum."""
+    """Return whether a file exists and has the header of a rigorous spectrum."""
     if not os.path.isfile(path):
         return False
     with open(path, "rb") as stream:

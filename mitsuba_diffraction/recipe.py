@@ -8,9 +8,9 @@ patches = 16                     # of a profile with a seed: number of seeds to 
 
 [surface]                        # … or a scan
 scan = "skin.png"                # relative to the recipe; formats: readers.read_height_field
-pixel_size = 0.0586              # µm, one number or [x, y]; if the file has none, or to override that of the file
+pixel_size = 0.0586              # µm, one number or [x, y]; needed if the file has none, else overrides it
 height_range = 0.375             # µm, for integer images
-channel = "Height"               # name or number, in a file with several; default: that of the heights
+channel = "Height"               # name or number, in a file with several; default: the heights
 unit = "nm"                      # of a file without one; ["um", "nm"]: lateral, and of the heights
 prepare = [                      # steps of surface/prepare.py, in this order
     "level_plane",               # or "level_quadratic"
@@ -69,7 +69,7 @@ _SCAN_KEYS = frozenset({"scan", "pixel_size", "height_range", "fill_missing", "c
 _SPECTRUM_KEYS = frozenset(f.name for f in fields(Settings))
 REQUESTED = "representation", "terms", "heights_from", "tolerance"  # of a spectrum; they may override a recipe's
 _OF_PROFILE = "coherence_length", "largest_height_range", *REQUESTED
-MAX_PATCHES = 1000  # after which speckle is three per cent of that of one patch
+MAX_PATCHES = 1000  # of which the mean has three per cent of the speckle of one patch
 # Incremented when the same input gives a different result, to invalidate the cache.
 _BUILD_VERSION = 10
 # Spectra in the package (precompute/ready_spectra.py), named as in the cache.
@@ -130,7 +130,9 @@ class Recipe:
 
     @classmethod
     def of_profile(cls, name: str, parameters: Mapping[str, Any], **settings: Any) -> Recipe:
-        """Return the recipe of a profile, from parameters as of a scene (`parameters_of_profile`); it ignores others.
+        """Return the recipe of a profile, from the parameters that a scene may give; others are ignored.
+
+        See `parameters_of_profile`.
 
         Args:
             name: of the profile.
@@ -180,7 +182,7 @@ class Recipe:
 
     @property
     def files(self) -> list[Path]:
-        """The files that the recipe names: its scan and that of an index, if there are any."""
+        """The files that the recipe names, if any: its scan, and the file of an index."""
         scans = [self.folder / self.surface["scan"]] if "scan" in self.surface else []
         return scans + ([Path(str(self.settings.material))] if is_file(self.settings.material) else [])
 

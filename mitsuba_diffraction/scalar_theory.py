@@ -46,7 +46,7 @@ _MIN_POWER = 1e-9  # of a wave, as a fraction of all
 _WAVES_PER_OCTAVE = 16  # of period, into which the waves of a surface are sorted
 
 MAX_TRUSTED_ERROR = 0.1  # above which a surface is considered outside the range of scalar theory
-# R.m.s. factor between the error estimated from the map and that of 48 solved profiles; docs/validation.md.
+# R.m.s. factor between the estimated error, from the map, and the solved error of 48 profiles; docs/validation.md.
 ESTIMATE_FACTOR = 1.4
 _MAX_SOLVER_ERROR = 1e-2
 
@@ -189,9 +189,9 @@ def transmitted_orders(
 ) -> Orders:
     """Compute K_t G_t (1 − F) η_m(κ_m), the transmitted orders of the BSDF in the limit of narrow lobes.
 
-    Arguments are those of `scalar_orders`, for a dielectric. The angle is that in air: of incidence, or for light from
-    below, of the direction into which a plane would refract it. The efficiencies sum to at most one. For a sheet, with
-    light from above, they include the transmittance 1 − F of the flat face.
+    For arguments see `scalar_orders`; the medium is a dielectric. The angle is measured in air. For light from below it
+    is the angle of the direction into which a plane would refract the light. The efficiencies sum to at most one. For a
+    sheet, with light from above, they include the transmittance 1 − F of the flat face.
     """
     n_i, n_o, side = (index, 1.0, -1) if from_below else (1.0, index, 1)
     m, steps = _lattice(wavelength / np.atleast_1d(period), n_i + n_o)
@@ -265,14 +265,14 @@ def expected_error(
     """Return the expected error of scalar theory for a surface at incidence up to some angle.
 
     The largest of the stored errors at 0°, 20°, 40° and 60° up to `largest_angle`, including conical incidence at 40°
-    and 60°, interpolated linearly in the logarithms. They are those of sinusoids. Other surfaces are represented by
-    their main period and their `equivalent_depth`; edges increase the error.
+    and 60°, interpolated linearly in the logarithms. The stored errors were computed for sinusoids. Other surfaces are
+    represented by their main period and their `equivalent_depth`; edges increase the error.
 
     Args:
         period: µm.
         depth: peak to valley, µm.
         wavelength: µm.
-        material: as of `error_map`.
+        material: see `error_map`.
         largest_angle: degrees.
         mean: of these errors instead of the largest.
 

@@ -218,8 +218,8 @@ def lobe_width(coherence_length: float) -> float:
 def lobe_cutoff(change: float) -> float:
     """Return half the side ρ of the square to which a lobe is truncated, in standard deviations.
 
-    A two-dimensional Gaussian has the fraction 1 − erf(ρ/√2)² outside that square. Truncation and renormalisation
-    change it by twice that in the L1 norm, which is set equal to `change`.
+    A two-dimensional Gaussian has the fraction 1 − erf(ρ/√2)² outside that square. Cutting the tails and rescaling
+    changes the Gaussian by twice this fraction in the L1 norm. ρ is chosen so that this equals `change`.
     """
     # 1 − √(1 − change/2) without cancellation.
     return float(-scipy.special.ndtri(-np.expm1(0.5 * np.log1p(-change / 2)) / 2))

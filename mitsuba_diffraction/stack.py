@@ -11,7 +11,7 @@ all media, z_j = n_j cos θ_j = √(n_j² − s²), the phase is δ_j = 2π d_j 
 (Abelès 1950; Born and Wolf 1999, §1.6). Films of constant thickness along the normal follow the relief, so that the
 phase e^{iκh} is the same at all of their faces, and R and T alone change. Each matrix is multiplied by e^{iδ_j}, so
 that nothing overflows in absorbing films; R does not change, t has the product of these factors. Indices are n + ik,
-fields e^{−iωt}. T is that of a medium below without absorption.
+fields e^{−iωt}. T holds for a medium below that does not absorb.
 """
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ from numpy.typing import NDArray
 from .materials import NOMINAL_WAVELENGTH, RefractiveIndex
 
 Array = Any
-"""An array of NumPy or of Dr.Jit."""
+"""A NumPy or Dr.Jit array."""
 Real = NDArray[np.float64]
 Plane = Callable[[Real], tuple[Real, Real]]
 """R and T of unpolarised light at the cosines of the angles of incidence."""
@@ -128,7 +128,7 @@ class Stack:
 
     @property
     def is_plain(self) -> bool:
-        """Whether R and T are those of a bare surface without dispersion."""
+        """Whether the surface is bare and its index the same at all wavelengths."""
         return self.below.is_constant and not any(thickness for _, thickness in self.films)
 
     def planes(self, wavelength: float, side: int, laterals: tuple[float, float], step: float) -> list[Plane]:
@@ -137,7 +137,7 @@ class Stack:
         Args:
             wavelength: µm, in vacuum, with the mean of the lateral scales.
             side: 1 for light from above, −1 from below.
-            laterals: bounds of the scale of lengths along the surface; that of the thickness is relative to it.
+            laterals: bounds of the scale of lengths along the surface; the scale of the thickness is relative to it.
             step: difference of 1/λ (1/µm) to either side for which R and T stand, too: it has the effect of another
                 thickness.
         """

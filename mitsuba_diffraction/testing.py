@@ -92,8 +92,8 @@ def evaluate_pdf(
         uv: (..., 2).
 
     Returns:
-        f cos θ_o in 1/sr, (..., c), in polarised variants that of unpolarised light; and the density in 1/sr of each
-        group of wavelengths, (..., g).
+        f cos θ_o in 1/sr, (..., c), for unpolarised light in polarised variants; and the density in 1/sr of each group
+        of wavelengths, (..., g).
 
     Raises:
         ValueError: if shapes do not match, or no spectral variant is set.
@@ -138,7 +138,7 @@ def sample(
     """Sample a BSDF.
 
     Args:
-        bsdf, context: as of `evaluate_pdf`.
+        bsdf, context: see `evaluate_pdf`.
         wi: ω_i, (n, 3), for one sample each.
         wavelengths: (c,) or (n, c) in nm, as many as a ray has.
         seed: of the random numbers.

@@ -85,7 +85,7 @@ def base_from(props: mi.Properties) -> Base | None:
 
 
 def _diffuse(value: Any) -> mi.BSDF:
-    """Return a diffuse BSDF of a reflectance, or of a colour as of HTML, "#a0522d"."""
+    """Return a diffuse BSDF of a reflectance, or of a colour as in HTML, "#a0522d"."""
     if is_number(value) and 0 <= value <= 1:
         return nested_plugin("diffuse", reflectance=float(value))
     if isinstance(value, str) and re.fullmatch("#[0-9a-fA-F]{6}", value):

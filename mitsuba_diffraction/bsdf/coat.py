@@ -20,14 +20,14 @@ from ..materials import RefractiveIndex
 from .indices import Dispersion, absolute_index, index_from
 from .tables import opaque
 
-SAME_INDEX = 1e-3  # indices of refraction that differ by less, as those of air and vacuum, are taken as equal
+SAME_INDEX = 1e-3  # indices of refraction that differ by less, as for air and vacuum, are taken as equal
 
 
 def coat_from(props: mi.Properties) -> Coat | None:
     """Return the layer given by `coat_ior`, or None, also for one that has the index of the outside.
 
     Raises:
-        RequestError: if its index is below one or below that of the outside.
+        RequestError: if its index is below one or below the index of the outside.
     """
     if "coat_ior" not in props:
         return None

@@ -65,7 +65,7 @@ class BinAxis:
 
 
 class BinSampler:
-    """The density of q in the disc of propagating light, f(q) of the table and that of its inversion q′ in the circle:
+    """The density of q in the disc of propagating light: f at q, and f at q′, the inversion of q in the circle:
 
         p(q) = f(q) + f(q′) (n_o/λ)⁴/|q − c|⁴,    f(q) = Σ_j w_j A_jnm/M_j / (Δ_x Δ_y)
 

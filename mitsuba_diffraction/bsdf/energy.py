@@ -84,7 +84,7 @@ class Energy:
     def bound(
         self, at: Coordinates, frequency: mi.Float, transmitted: mi.Bool | bool = False, ratio: mi.Float | float = 1.0
     ) -> mi.Float:
-        """Return e of one direction, for transmitted or reflected light; other arguments as of `factor`."""
+        """Return e of one direction, for transmitted or reflected light; for other arguments see `factor`."""
         side, slices, weights = integer_part(self.side), integer_part(self.last_slice) + 1, []
         index, tables = mi.UInt32(0), 4 if self.two_sided else 1
         if self.two_sided:

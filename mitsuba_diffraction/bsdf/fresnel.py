@@ -88,7 +88,7 @@ def reflectance_from(props: mi.Properties, coat: Coat | None) -> Material:
         raise RequestError(
             f"{named}: a conductor or a perfect mirror takes no int_ior or ext_ior; give one or the other"
         )
-    # There is no coat if its index is that of the outside.
+    # There is no coat if its index equals the index of the outside.
     outside = coat.index if coat is not None else absolute_index("ext_ior", props.get("ext_ior", 1.0))
     if own:
         if "material" in props or own == ["k"]:

@@ -6,11 +6,11 @@ A coat and the flat face of a sheet are plane layers: they keep the tangential c
 normal one, so that k next to the relief follows from k outside. κ has a sign: as S(q; −κ) = S(−q; κ), the tables for
 κ ≥ 0 are read at −q where κ < 0.
 
-K and G are those of each order where orders are evaluated one by one (`Geometry.order_squares_and_gain`), and those of
-the pair of directions for continua (`Geometry.continuum_factor`).
+Separate orders: K and G are computed per order (`Geometry.order_squares_and_gain`). Continua: K and G are computed
+once, from the two directions (`Geometry.continuum_factor`).
 
 Where v_z → 0, which occurs in transmission, K diverges and S(q; κ) falls as κ². For |κ| < κ₁, v_z² in K is replaced by
-that of κ₁, and S by κ₁²/κ² S (`furnace.small_kappa`).
+v_z² at κ₁, and S by κ₁²/κ² S (`furnace.small_kappa`).
 """
 
 from __future__ import annotations
@@ -62,8 +62,8 @@ class WaveVector:
         return mi.Vector3f(*self.tangent, self.z) / self.inner_index
 
 
-# Of reflected and of transmitted samples: if the transmitted fraction is tabulated, if it is that of a plane, and in
-# rigorous theory, where it is that of a plane although fine gratings differ much from one.
+# Of reflected and of transmitted samples: with a tabulated transmitted fraction; with the transmitted fraction of a
+# plane; in rigorous theory, which uses the fraction of a plane although fine gratings differ much from a plane.
 MIN_TABULATED_PROBABILITY, MIN_PLANE_PROBABILITY, MIN_RIGOROUS_PROBABILITY = 0.05, 0.1, 0.2
 
 
@@ -83,10 +83,10 @@ class Interface:
         kappas: the two bounds whose minimum is κ₁, in rad/µm for unscaled heights (`furnace.small_kappas`); None where
             κ₁ is zero, in reflection and for rigorous theory.
         transmitted_fraction: returns the transmitted fraction of power for a direction along the pattern's axes, where
-            an `OrderSampler` draws orders; None for rigorous theory and where orders overlap, which use that of a
-            plane.
-        disperses: whether the index of the coat or that below varies with the wavelength; `coat_index` and `eta` are
-            those in the middle of visible light, and `at` returns those of a wavelength.
+            an `OrderSampler` draws orders. None for rigorous theory and where orders overlap: the fraction of a plane
+            is used.
+        disperses: whether the index of the coat or of the medium below varies with the wavelength. `coat_index` and
+            `eta` are given for the middle of visible light; `at` returns the indices at a wavelength.
     """
 
     def __init__(
@@ -233,8 +233,8 @@ class Geometry:
     def cos_half(self) -> mi.Float:
         """Return the cosine of ω and h, negative from below as `mi.fresnel` expects.
 
-        ω is ω_i of reflected light, and the direction above of transmitted light: R is that of the reversed pair, and
-        rounding errors are then those of the reversed pair, too, where it is nearly one.
+        For reflected light ω = ω_i; for transmitted light ω is whichever direction lies above. A pair and its reverse
+        then have the same R, even in rounding near R = 1.
         """
         k_i, k_o = self.incident, self.outgoing
         square = dr.squared_norm(self.tangent) + dr.square(self.v_z)
@@ -260,9 +260,10 @@ class Geometry:
         return self.k_g(*squares, dr.squared_norm(tangent), incidence) * gain * self.factor
 
     def order_kappa(self, tangent: mi.Vector2f, incidence: Incidence) -> mi.Float:
-        """Return |κ| in rad/µm: for reflected light that of the pair, for transmitted light that of the order.
+        """Return |κ| in rad/µm: of the two directions for reflected light, of the order for transmitted light.
 
-        K grows as 1/v_z² and the power falls as κ²; for transmitted light both use the v_z of the order.
+        In transmission K grows as 1/v_z² and the power falls as κ². Both use the v_z of the order, so that these
+        factors cancel.
         """
         (square_i, square_o), _ = self.order_squares_and_gain(self.kappa_sign * tangent, mi.Float(0))
         v_z = dr.select(self.reflects, self.v_z, self.incident.normal(square_i) - self.outgoing.normal(square_o))
@@ -291,9 +292,9 @@ class Geometry:
         """Return k_z² of an order in both media, outside, for its K and G, and the gain Γ of its lobe.
 
         The lobe contains the pair of directions. The order diffracts ω_i into a direction near ω_o, and ω_o into one
-        near ω_i. Each k_z² is the mean of that of the pair and that of the order, which agree at the centre of the
-        lobe. K of the pair would diverge within the lobe at grazing incidence; with these k_z², K G of the mirror order
-        is one.
+        near ω_i. Each k_z² is the average of two values: one from the actual directions, one from the order's exact
+        direction. They agree at the centre of the lobe. At grazing incidence K of the actual directions would diverge
+        within the lobe; with the average, K G of the mirror order is one.
 
         The gain compensates the part of the lobe below the horizon, and is zero where the order does not propagate.
         With σ the width of the lobe in direction cosines, x = cos² θ/2σ is the distance from the horizon in standard
@@ -338,7 +339,7 @@ def cos_square(k: WaveVector, change: mi.Vector2f) -> mi.Float:
 class Incidence:
     """Incident light of one wavelength and direction, scattered into one of the media, for samplers.
 
-    κ of reflected light is positive above and negative below; that of transmitted light is assumed negative, as it is
+    κ of reflected light is positive above and negative below. κ of transmitted light is assumed negative, as it is
     except for steeply diffracted light. Where κ is negative and orders overlap, −q is drawn.
 
     Attributes:
@@ -346,7 +347,7 @@ class Incidence:
         wavelength: λ in µm.
         frequency: 1/λ.
         lobe_scale: factor of the widths of lobes.
-        coat_index: as of `Interface`.
+        coat_index: see `Interface`.
         above: whether light is incident from above.
         reflects: whether reflected light is considered, else transmitted light.
         index: n_i outside.
@@ -355,8 +356,8 @@ class Incidence:
         square: n_o² − |k_i,∥|².
         height_scale: factor of the heights.
         per_kappa: |v_z| for one rad/µm.
-        near_undiffracted: the minimum of |v_z| for |k_oz| between 0.7 and 1 times that of the undiffracted order, and
-            the reciprocal of the length of the interval of |v_z|.
+        near_undiffracted: the minimum of |v_z| for |k_oz| between 0.7 and 1 times the |k_oz| of the undiffracted order,
+            and the reciprocal of the length of the interval of |v_z|.
         k_iz: |k_iz|.
         k_oz: |k_oz| at the horizon and along the normal, and the reciprocal of their difference.
     """

@@ -36,7 +36,7 @@ class Grating:
         recipe: from which the spectrum was built; None for a saved one.
         theory: the powers of orders, and R, E and other factors.
         coat: over the grating, or None.
-        scales, orientation, from_radius: as of `GratingRequest`.
+        scales, orientation, from_radius: see `GratingRequest`.
     """
 
     def __init__(self, props: mi.Properties, request: GratingRequest) -> None:
@@ -64,9 +64,9 @@ class Grating:
         return [(low, high) for low, high in parts if high - low > 1e-6 * high]
 
     def cover(self, wavelengths: tuple[float, float]) -> None:
-        """Take the wavelengths of light, (shortest, longest) in air, nm, beside those taken before.
+        """Extend the covered range to include the wavelengths (shortest, longest), nm in air.
 
-        A spectrum from a recipe or a profile is computed anew where it ends before.
+        A spectrum from a recipe or a profile is computed again if it does not cover this range.
 
         Raises:
             RequestError: if the material or a saved spectrum does not cover them, or the coherence length is shorter.
@@ -90,7 +90,7 @@ class Grating:
                 raise
             self.recipe, self.spectrum = recipe, recipe.cached(_per_cent)
             self.theory = theory_of(self._props, self.spectrum, self._request)
-            # The parameters are no longer those of the request.
+            # The user may have changed the parameters since the request.
             self.theory.parameters_changed([])
             self.theory.cover(wavelengths)
 
@@ -247,7 +247,7 @@ class Grating:
         gradients it is unrolled, as Dr.Jit cannot differentiate it in reverse mode.
 
         Args:
-            si, pending: as of `_diffracted`.
+            si, pending: see `_diffracted`.
             at: returns the pair of directions, and a factor of the value, from `state` at a wavelength in nm.
             state: all arrays with derivatives.
             lateral_scale: of lengths along the surface.

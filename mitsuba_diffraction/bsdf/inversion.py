@@ -1,7 +1,7 @@
 """Common parts of the samplers: a mixture over a few bins of κ, bins of directions, inversion of cumulative sums.
 
 The optimal density of q is proportional to S(q; κ), but κ = 2π (cos θ_i + cos θ_o)/λ is known only once q is. For all
-outgoing directions cos θ_i ≤ κλ/2π ≤ 1 + cos θ_i. If cos θ_o has the density 2 cos θ_o, that of a diffuse surface, the
+outgoing directions cos θ_i ≤ κλ/2π ≤ 1 + cos θ_i. If cos θ_o has the density 2 cos θ_o, as for a diffuse surface, the
 bin κ_j ≤ κ ≤ κ_{j+1} has the weight
 
     w_j = e_{j+1}² − e_j²,    e_j = clip(κ_j λ/2π − cos θ_i, 0, 1),    Σ_j w_j = 1

@@ -44,9 +44,9 @@ class Layers:
     Attributes:
         coat: or None.
         grating: component 0.
-        base: or None; its components follow that of the grating.
-        components: the flags of all components: reflection and transmission of the grating, those of the base, and, as
-            the last one, the front face of a coat or the flat face of a sheet.
+        base: or None; its components follow the component of the grating.
+        components: the flags of all components, in this order: reflection and transmission of the grating; the
+            components of the base; the front face of a coat or the flat face of a sheet.
     """
 
     def __init__(self, props: mi.Properties) -> None:
@@ -172,7 +172,7 @@ class Layers:
         active: mi.Bool,
         wo_is_sample: bool = False,
     ) -> tuple[mi.Spectrum, mi.Float]:
-        """Evaluate f cos θ_o and the density, as `mi.BSDF.eval_pdf`; `wo_is_sample` as of `Grating.evaluate`."""
+        """Evaluate f cos θ_o and the density, as `mi.BSDF.eval_pdf`; for `wo_is_sample` see `Grating.evaluate`."""
         cos_i, cos_o = mi.Frame3f.cos_theta(si.wi), mi.Frame3f.cos_theta(wo)
         request = self._request(ctx)
         active = active & self.interface.is_incident(cos_i) & self.interface.is_incident(cos_o)
@@ -240,7 +240,7 @@ class Layers:
         sample2: mi.Point2f,
         active: mi.Bool,
     ) -> tuple[mi.BSDFSample3f, mi.Spectrum]:
-        """Draw a direction from the grating or its base; `probability` is that of not sampling the face."""
+        """Draw a direction from the grating or its base; the face is not sampled with the probability `probability`."""
         cos_i, base_context = mi.Frame3f.cos_theta(si.wi), request.base
         bs = dr.zeros(mi.BSDFSample3f)
         bs.eta = 1.0

@@ -34,7 +34,7 @@ def cover_light(scene: mi.Scene, sensor: mi.Sensor | int | None = None) -> None:
 
     Args:
         scene: with its current parameters.
-        sensor: that of a picture, or its number; default: all sensors of the scene.
+        sensor: the sensor of a picture, or its number; default: all sensors of the scene.
 
     Raises:
         RequestError: if the tables of one cannot; it names the range, and how to widen it.
@@ -59,9 +59,11 @@ def cover_light(scene: mi.Scene, sensor: mi.Sensor | int | None = None) -> None:
 
 
 def _emits(emitter: mi.Emitter, low: float, high: float) -> bool:
-    """Return whether a light may emit between two wavelengths, nm; of one without a spectrum, whether they are visible.
+    """Return whether a light may emit in [low, high] nm.
 
-    Samples of wavelengths do not answer this, as Mitsuba draws those of some spectra from a part of their range.
+    Lights without a spectrum are assumed to emit all visible light.
+
+    Samples of wavelengths do not answer this: for some spectra Mitsuba draws samples from a part of their range.
     """
 
     spectra = parts(emitter, mi.Texture)

@@ -51,7 +51,7 @@ class OrderSampler:
     Attributes:
         cumulative: cumulative sums of P_m over the rectangle of orders that propagate in a bin, in units of 2⁻²⁴.
         bins: for each bin the start in `cumulative`, the first column and row of its rectangle among all orders, and
-            the number of columns + 2¹⁶ times that of rows.
+            the number of columns + 2¹⁶ times the number of rows.
         counts: numbers of bins of 1/λ and along a side of the square; opaque, as they depend on the surface.
         fractions: T e_T/(R e_R + T e_T) in finer bins of directions, from above and from below.
     """

@@ -81,7 +81,7 @@ class SlicePower(_NodeTable):
     """c_m(κ) = Σ_p a_p t^p, −1 ≤ t ≤ 1 on an interval of κ, from packets of one, two or four words."""
 
     def __init__(self, table: SliceTable, rim: tuple[int, int] = (0, 0), windows: bool = True) -> None:
-        """Arrange a table; `rim` and `windows` as of `_NodeTable`."""
+        """Arrange a table; for `rim` and `windows` see `_NodeTable`."""
         super().__init__(table.shape, rim, windows)
         values = self._arranged(table.values)
         words = table.words_per_node
@@ -153,7 +153,7 @@ class AmplitudePower(_NodeTable):
     """
 
     def __init__(self, table: AmplitudeTable, rim: tuple[int, int] = (0, 0), windows: bool = True) -> None:
-        """Arrange a table; `rim` and `windows` as of `_NodeTable`."""
+        """Arrange a table; for `rim` and `windows` see `_NodeTable`."""
         super().__init__(table.shape, rim, windows)
         count = len(table.terms)
         pairs = -(-count // 2)
@@ -192,7 +192,7 @@ class AmplitudePower(_NodeTable):
         at: tuple[mi.Float, mi.Float],
         active: mi.Bool,
     ) -> mi.Float:
-        """Return Σ_ij w_x,i w_y,j η_ij over a window of orders; arguments as of `SlicePower.window`."""
+        """Return Σ_ij w_x,i w_y,j η_ij over a window of orders; for arguments see `SlicePower.window`."""
         rows, columns = self._window(row, column, len(weights_y), len(weights_x))
         kappa, factor = at
         weights = [y * x for y in weights_y for x in weights_x]
@@ -261,7 +261,7 @@ class OrderSpectrum:
     be scaled; for a tile as large as the coherence length, 4 × 4 orders contribute.
 
     For resolved orders the density is Σ_m P_m N(q − m/T), with P_m of an `OrderSampler`, which depends on the media and
-    scales of a scene. For overlapping orders, and for line gratings with wide lobes, it is that of `BinSampler`.
+    scales of a scene. For overlapping orders, and for line gratings with wide lobes, it is the density of `BinSampler`.
 
     Attributes:
         axes: the orders along x and y.
@@ -275,7 +275,7 @@ class OrderSpectrum:
     sampler: OrderSampler | BinSampler
 
     def __init__(self, spectrum: GratingSpectrum, typical_max_kappa: float | None) -> None:
-        """Arrange the tables; `typical_max_kappa` as of `KappaBins`."""
+        """Arrange the tables; for `typical_max_kappa` see `KappaBins`."""
         grid, sigma = cast(OrderGrid, spectrum.grid), spectrum.lobe_width
         self.axes = tuple(
             _Axis(lobe, size, max_order, sigma)
@@ -315,8 +315,8 @@ class OrderSpectrum:
     def evaluate(self, geometry: Geometry, incidence: Incidence, active: mi.Bool) -> tuple[mi.Float, mi.Float]:
         """As `Scattering.evaluate`.
 
-        For resolved orders, and for all orders of line gratings, K and G are those of each order, with the gain of its
-        lobe (`Geometry.order_factor`). For other tiles they are those of the pair of directions
+        For resolved orders, and for all orders of line gratings, K and G are computed per order, with the gain of its
+        lobe (`Geometry.order_factor`). For other tiles they are computed once, from the two directions
         (`Geometry.continuum_factor`).
         """
         scale = incidence.lobe_scale

@@ -335,7 +335,7 @@ def check_transmission(of_spectrum: str, media: Media) -> None:
     """Check `transmission` of a rigorous spectrum.
 
     Raises:
-        RequestError: if it differs from that of the scene.
+        RequestError: if it differs from `transmission` of the scene.
     """
     if of_spectrum != media.transmission:
         raise RequestError(

@@ -1,4 +1,4 @@
-"""Mueller matrices of a grating: for scalar theory those of a plane at the half vector, for rigorous theory exact.
+"""Mueller matrices of a grating: of a plane at the half vector in scalar theory, exact in rigorous theory.
 
 docs/validation.md compares the former with rigorous results.
 """
@@ -64,8 +64,8 @@ def of_facets(
     """Return the matrix of a plane perpendicular to h, the normal of the facet that reflects or refracts a pair.
 
     Args:
-        value: R K G E S/λ² cos θ_o of unpolarised light, R the mean of R_s and R_p at the half vector, or that of
-            transmitted light.
+        value: R K G E S/λ² cos θ_o of unpolarised light, with R the mean of R_s and R_p at the half vector; or the
+            value of transmitted light.
         planes: returns the matrices between s axes at each wavelength, up to a factor, from the cosine of the direction
             of incidence and h, negative from below, and from whether light is reflected.
         eta: index below relative to that above.

@@ -76,7 +76,7 @@ class RigorousOrders:
         p = g + α,    r = g − α,    α = −ω_i,x ν,    g = ν √(1 − ω_i,y²),
 
     and of the wavelength; all orders of one incident direction are in the same bin. With transmission, α and g are
-    those of the medium of ω_i, and reflected and transmitted light from above and from below have separate bins.
+    computed in the medium of ω_i. Reflected and transmitted light from above and from below have separate bins.
     """
 
     resolved = True
@@ -158,7 +158,7 @@ class RigorousOrders:
         """Return M_ij / M_00 over all orders whose lobes contain a pair of directions; else the identity.
 
         Args:
-            k_i, k_o: of source and exit, along the pattern's axes; under a coat those of the directions inside.
+            k_i, k_o: of source and exit, along the pattern's axes; under a coat, of the directions inside.
             frequency: 1/λ in cycles/µm, next to the relief above.
             active: mask.
         """
@@ -273,7 +273,7 @@ class RigorousOrders:
             dr.clip(mi.Int32(self.bins_per_unit * _arc_coordinate(larger(x, 0))), 0, self.bins_across - 1)
             for x in (g - along, g + along)
         )
-        # λ is that above, g that of the medium of ω_i.
+        # λ is measured above, g in the medium of ω_i.
         z = dr.clip(
             mi.Int32(self._z(g / incidence.index, frequency) * self.wavelength_bins), 0, self.wavelength_bins - 1
         )

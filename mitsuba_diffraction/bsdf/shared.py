@@ -46,8 +46,8 @@ class SharedTables:
         if isinstance(spectrum, RigorousSpectrum):
             self.table = RigorousOrders(spectrum)
         else:
-            # Of nearly all transmitted light: 1.5 times that of undiffracted light along the normal, at the shortest
-            # visible wavelength.
+            # Above κ of nearly all transmitted light: 1.5 times κ of undiffracted light along the normal, at the
+            # shortest visible wavelength.
             max_kappa = None if stack is None else 3 * np.pi * abs(stack.nominal - 1) / (VISIBLE[0] * 1e-3)
             kind = OrderSpectrum if isinstance(spectrum.grid, OrderGrid) else SplineSpectrum
             self.table = kind(spectrum, max_kappa)

@@ -33,7 +33,7 @@ def limited(x: mi.Float, low: float, high: float) -> mi.Float:
 def integer_part(x: mi.Float) -> mi.UInt32:
     """Return the integer part of x, 0 ≤ x < 2³¹.
 
-    Conversions between float32 and int32 are one instruction, those of uint32 take LLVM several without AVX-512.
+    LLVM converts between float32 and int32 in one instruction. For uint32 it needs several without AVX-512.
     """
     return mi.UInt32(mi.Int32(x))
 
@@ -103,7 +103,7 @@ def aligned(values: np.ndarray) -> np.ndarray:
 class SharedExponentTable:
     """A flat table of packets of three numbers in a word of 32 bits: nine bits for each and five for one exponent.
 
-    The format is RGB9E5 with signs. Values are read times `1/unit`.
+    The format is RGB9E5 with signs. Multiply what is read by `unit`.
     """
 
     unit = 2.0 ** (126 + MIN_EXPONENT)  # the exponent 1 is 2⁻¹²⁶ in a float32

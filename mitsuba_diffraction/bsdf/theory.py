@@ -35,7 +35,7 @@ MAX_FILM_CHANGE = 5e-4  # µm, of a film, up to which a table is reused
 _log = logging.getLogger(__name__)
 
 
-_MAX_ERROR = 1.0  # of a spectrum, a fraction of the light: that of a black one
+_MAX_ERROR = 1.0  # of a spectrum, a fraction of the light; a black spectrum has this error
 _shows_errors = False
 
 
@@ -236,7 +236,7 @@ class ScalarTheory(Theory):
                 _warn(self.spectrum.source, warning + of_glass)
 
     def _films_changed(self) -> bool:
-        """Return whether films differ from those of the tables by more than `MAX_FILM_CHANGE`."""
+        """Return whether films differ from the films of the tables by more than `MAX_FILM_CHANGE`."""
         stack, before = self._stack(), self.tables.stack
         if stack is None or before is None:
             return False

@@ -1,7 +1,7 @@
 """Thin films on the relief: zinc sulphide of a hologram, the oxide of anodised titanium, the stack of a beetle.
 
-R and T are those of a plane under the films, by the characteristic matrices of `../stack.py`. One film is evaluated
-without a loop, several by a loop over a table of their indices, whose length is opaque.
+R and T of a plane under the films follow from the characteristic matrices of `../stack.py`. One film is evaluated
+without a loop. Several films are evaluated by a loop over a table of their indices, whose length is opaque.
 """
 
 from __future__ import annotations

@@ -42,7 +42,7 @@ class VaryingNumber:
         """Read the values again, as the user may have changed them.
 
         Raises:
-            RequestError: if they are unknown, as those of a mesh attribute, or not finite.
+            RequestError: if they are unknown, as for a mesh attribute, or not finite.
         """
         found = [self.value]
         if self.varies:
@@ -97,7 +97,7 @@ def check_texture(name: str, texture: mi.Texture) -> None:
     """Check the values of a texture in the place of a number.
 
     Raises:
-        RequestError: if some are not finite, or those of a bitmap are colours.
+        RequestError: if some are not finite, or a bitmap has colours.
     """
     parameters = mi.traverse(texture)
     for key in parameters.keys():  # noqa: SIM118

@@ -75,7 +75,7 @@ class Furnace:
         lobe_scale: the factor of the widths of lobes of orders.
         stack: the dielectric with its films, if light is transmitted.
         side: 1 if ω is above the surface, −1 if below.
-        planes: R and T of its plane at one wavelength (`at`), one for each thickness; those of a bare surface if empty.
+        planes: R and T of its plane at one wavelength (`at`), one for each thickness. If empty, the surface is bare.
     """
 
     spectrum: PowerSpectrum = field(repr=False)
@@ -143,7 +143,7 @@ class Furnace:
     def at(self, wavelength: float, laterals: tuple[float, float] = (1.0, 1.0), step: float = 0.0) -> Furnace:
         """Return the components with the index and R and T of a plane at one wavelength, µm in the medium above.
 
-        `laterals` are the bounds of the scale of lengths s, by which the wavelength is divided; `step` as of
+        `laterals` are the bounds of the scale of lengths s, by which the wavelength is divided; for `step` see
         `Stack.planes`.
         """
         if self.stack is None or self.stack.is_plain:
@@ -245,7 +245,7 @@ class Furnace:
         cos_i, length = cos_i[i], length[i]
         mean_cos_i = mean_cosine(cos_i**2, sigma)
         value, cosine = self._factor(mean_cos_i, cos_o, length, length**2 * (q**2).sum(-1)[j], branch)
-        # κ of reflected light is that of the pair of directions, κ of transmitted light that of the order.
+        # Reflected light uses κ of the two directions; transmitted light uses κ of the order's exact direction.
         kappa = self._kappa(mean_cos_i if branch else cos_i, cos_o if branch else cos_exit, length, branch)
         return i, j, weight * value * self._power(j, kappa, branch), cosine
 

@@ -93,7 +93,7 @@ class Layout:
 
     @property
     def lines(self) -> bool:
-        """Whether the table is that of a line grating."""
+        """Whether the table belongs to a line grating."""
         return self.period > 0
 
     @property
@@ -287,7 +287,7 @@ def _bounds(
     if stack is None or stack.is_plain:
         slices = [np.arange(len(omega))]
     else:
-        # R and T of films, and the index, are those of each wavelength, of which there are few.
+        # R and T of films, and the index, depend on the wavelength; there are few wavelengths.
         slices = [np.flatnonzero(wavelengths == wavelength) for wavelength in np.unique(wavelengths)]
     step = (layout.frequencies[1] - layout.frequencies[0]) / (2 * max(layout.slices - 1, 1))
     for (k, ratio), slice_ in itertools.product(enumerate(ratios), slices):

@@ -205,8 +205,9 @@ class _Build:
     def __call__(self) -> tuple[SliceTable, float]:
         """Return the cheapest table and its measured error.
 
-        The bound of interpolation gives the number of intervals. A table whose measured error, with that of splines
-        and of rounding, is above the tolerance nevertheless gets one interval more, then the next format.
+        The bound of interpolation gives the number of intervals. If the measured error (interpolation + splines +
+        rounding) still exceeds the tolerance, one interval is added; if that is not enough, the next, more precise
+        format is tried.
         """
         error, refusal = np.inf, None
         for storage in _STORAGES if np.prod(self._exact.grid.shape) > _MAX_UNPACKED_NODES else _STORAGES[-1:]:

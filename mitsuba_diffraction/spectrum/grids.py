@@ -86,7 +86,7 @@ class OrderGrid(_Rectangle):
         return x, y
 
     def take(self, powers: NDArray, half: float = 0.5) -> NDArray:
-        """Select the kept orders, in the order of `axes`, from the powers of all, (N_y, N_x), as of `scipy.fft.fft2`.
+        """Select the kept orders, in the order of `axes`, from the powers of all, (N_y, N_x), as in `scipy.fft.fft2`.
 
         The Nyquist order of an even N has no sign: both signs get the factor `half`, for amplitudes √½.
         """
@@ -239,6 +239,6 @@ def spline_integral(x: NDArray[np.floating]) -> NDArray[np.float64]:
 
 
 def inner(grid: OrderGrid | SplineGrid, kept: OrderGrid | SplineGrid) -> tuple[slice, slice]:
-    """Return slices of the nodes of `kept` among those of the larger `grid`."""
+    """Return slices of the larger `grid` that select the nodes of `kept`."""
     rows, columns = (slice(m - n, m + n + 1) for m, n in zip(grid.max_order[::-1], kept.max_order[::-1], strict=True))
     return rows, columns

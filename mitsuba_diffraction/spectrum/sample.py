@@ -136,7 +136,8 @@ class _Lags:
         # At the last frequency, too, three nodes contribute.
         self.max_order = int(np.rint(self.max_q / self.spacing)) + 1
         self.lags = np.arange(-lags, lags + 1)
-        # The least-squares projection on splines: the transform of B over that of its autocorrelation at integers.
+        # The least-squares projection on splines: the transform of B over the transform of B's autocorrelation at
+        # integers.
         x = self.lags / self.count
         self.projection = np.sinc(x) ** 3 * 60 / (33 + 26 * np.cos(2 * np.pi * x) + np.cos(4 * np.pi * x))
         # The autocorrelation of the window, for a uniform axis.
@@ -202,7 +203,7 @@ class SamplePowers:
         return self._transform(self._autocorrelation(kappa) * y.projection[:, None] * x.projection[x.lags >= 0])
 
     def derivative_bound(self, n: int) -> float:
-        """Return an upper bound of ∫|∂ⁿS/∂κⁿ| dq, µmⁿ: the mean of those of all windows."""
+        """Return an upper bound of ∫|∂ⁿS/∂κⁿ| dq, µmⁿ: the mean of the bounds of all windows."""
         x, y = self._windows
         weights = np.outer(y.window, x.window) ** 2
         segments = np.lib.stride_tricks.sliding_window_view(self._height_field.heights, weights.shape)
@@ -233,8 +234,8 @@ def standard_error(
 ) -> float:
     """Return ∫ dq of the standard error of S(q; κ), a fraction of the reflected power; the maximum over four κ.
 
-    Welch's estimate Ŝ is the mean of P periodograms S_p. Those of overlapping windows are correlated; where the
-    phase is that of many independent features (Welch 1967, eq. 10 and 11; a is the window, Σ a² = 1),
+    Welch's estimate Ŝ is the mean of P periodograms S_p. Periodograms of overlapping windows are correlated. Where the
+    phase results from many independent features (Welch 1967, eq. 10 and 11; a is the window, Σ a² = 1),
 
         ρ_ij = (Σ_n a(x_n − x_i) a(x_n − x_j))²,     var Ŝ(q) = σ²(q)/P_eff,     1/P_eff = Σ_ij ρ_ij/P²,
 

@@ -38,10 +38,10 @@ def derivative_bound(heights: NDArray[np.float64], weights: ArrayLike, n: int) -
 class SliceTable:
     """c_m as a polynomial on each of K equal intervals of 0 ≤ κ ≤ κ_max, through its values at Chebyshev points.
 
-    On an interval Δκ the error ∫|ΔS| dq of a cubic through Chebyshev points is at most Δκ⁴/3072 times the maximum of
-    ∫|∂⁴S/∂κ⁴| dq, that of a parabola Δκ³/192 times that of the third derivative. `derivative_bound` bounds them by the
-    moments of the heights, so that the number of intervals that a tolerance needs is known beforehand
-    (`intervals_for`). Deep surfaces need more intervals but lose no digits.
+    The error ∫|ΔS| dq of interpolation through Chebyshev points of an interval Δκ has an upper bound. Cubic: Δκ⁴/3072 ·
+    max ∫|∂⁴S/∂κ⁴| dq. Parabola: Δκ³/192 · max ∫|∂³S/∂κ³| dq. `derivative_bound` bounds these integrals by the moments
+    of the heights, so that the number of intervals that a tolerance needs is known beforehand (`intervals_for`). Deep
+    surfaces need more intervals but lose no digits.
 
     Attributes:
         max_kappa: κ_max in rad/µm.

@@ -112,7 +112,7 @@ class TileSplines:
         return along_y @ self._powers(kappa) @ along_x.T
 
     def derivative_bound(self, n: int) -> float:
-        """Return an upper bound of ∫|∂ⁿS/∂κⁿ| dq, µmⁿ: a lobe does not change that of its order."""
+        """Return an upper bound of ∫|∂ⁿS/∂κⁿ| dq, µmⁿ: lobes have the same bound as their orders."""
         return self._powers.derivative_bound(n)
 
     def reached(self, powers: NDArray[np.float64]) -> float:
