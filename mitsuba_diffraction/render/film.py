@@ -30,8 +30,8 @@ from .scene import channel_wavelengths, channel_weights, no_warnings, recorded_r
 Rows = tuple[int, int]
 """The first row of a band of a picture, and the row after its last."""
 
-# A band of this many pixels takes 1.4 GB.
-BAND_PIXELS = 2**20
+# A band of this many pixels, 1024 × 768, takes up to 1.3 GB.
+BAND_PIXELS = 3 * 2**18
 _SPOOLED_BYTES = 2**22  # in memory for each band
 
 # Index of a pixel (row by row), mask → index of its first sample and one past its last; they are contiguous.
