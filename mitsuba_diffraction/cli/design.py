@@ -12,9 +12,11 @@ from PIL import Image, ImageOps
 
 from ..errors import RequestError
 from ..files import refuse_special
-from ..inverse_design import Design, Verdict
+from ..inverse_design import Design, Verdict, makers
 from ..inverse_design import design as search
+from ..inverse_design.build import WHITE
 from ..inverse_design.output import SUFFIXES, save
+from ..inverse_design.plate import for_detail
 from ..outputs import check_outputs, free_name
 from ..progress import progress_bar, say, show, table, tell
 from .arguments import Overwrite, check_suffix, numbers
@@ -27,7 +29,13 @@ def design(
         Path | None, typer.Option("-o", "--output", help="relief (.gsf, .tif); default: ./TARGET_relief.gsf")
     ] = None,
     texel: Annotated[float, typer.Option(help="side of a texel, µm")] = 0.8,
-    texels: Annotated[int, typer.Option(help="texels along the period of the relief")] = 32,
+    texels: Annotated[int | None, typer.Option(help="texels along the period of the relief; default: 32")] = None,
+    detail: Annotated[
+        float | None,
+        typer.Option(
+            help="number of its finest strokes along an edge of the picture; sets --texels, and --angle if need be"
+        ),
+    ] = None,
     height_range: Annotated[float, typer.Option(help="largest difference of heights, µm")] = 0.8,
     angle: Annotated[
         float, typer.Option(help="degrees from the mirror direction to the middle of an edge of the picture")
@@ -48,6 +56,9 @@ def design(
     ] = "outside",
     levels: Annotated[int | None, typer.Option(help="number of equidistant heights; default: continuous")] = None,
     tool_blur: Annotated[float, typer.Option(help="standard deviation of the tool's blur, µm")] = 0.13,
+    export: Annotated[
+        list[str] | None, typer.Option(help="also write: stl, gds (of --levels) or master (of a mould); repeatable")
+    ] = None,
     starts: Annotated[int, typer.Option(help="random reliefs, of which the best is continued; more take longer")] = 24,
     seed: Annotated[int, typer.Option(help="of the random reliefs")] = 0,
     overwrite: Overwrite = False,
@@ -57,18 +68,28 @@ def design(
     path = output or Path(f"{default}.gsf")
     check_suffix("-o", path, ".gsf", ".tif")
     picture = read_target(target, invert=invert)
-    check_outputs([target], [("-o", path.with_suffix(suffix)) for suffix in SUFFIXES], overwrite=overwrite)
+    exports = makers.export_paths(export or [], path)
+    if "gds" in exports:
+        makers.check_gds(levels)
+    outputs = [path.with_suffix(suffix) for suffix in SUFFIXES]
+    outputs += exports.values()
+    check_outputs([target], [("-o", output) for output in outputs], overwrite=overwrite)
     if picture.max() == 0:
         help_ = "" if invert else "; --invert casts what is dark"
         raise RequestError(f"{target}: got {'white' if invert else 'black'} alone, wanted light somewhere{help_}")
     if not invert and _is_dark_on_light(picture):
         say("note", f"{target} is light up to its edges; --invert casts what is dark in it, with more contrast")
     wavelengths = None if wavelength is None else numbers("--wavelength", wavelength).tolist()
+    if detail is not None:
+        if texels is not None:
+            raise RequestError(f"--detail: got {detail:g} and --texels {texels}, wanted one of them")
+        texels, angle = for_detail(detail, texel, angle, max(wavelengths or WHITE))
+        say("note", f"{texels} texels along the period, angle {angle:g}°, for strokes of 1/{detail:g} of the picture")
     with progress_bar(f"design of {target.name}", "iterations") as progress:
         found = search(
             picture,
             texel,
-            texels,
+            texels or 32,
             height_range,
             angle,
             wavelengths,
@@ -82,6 +103,7 @@ def design(
             progress=progress,
         )
     paths = save(found, path)
+    makers.export(found, exports)
     _report(found)
     relief, tiff, recipe, figure = paths
     field = found.height_field
@@ -90,6 +112,8 @@ def design(
         f"{field.pixel_size[0] * 1e3:.4g} nm, {height_range:g} µm from black to white; its top row is at the lowest "
         f"y\n{recipe}: its recipe, for scenes\n{figure}: target, prediction and relief"
     )
+    for name, file in exports.items():
+        tell(f"{file}: {makers.EXPORTS[name][1]}")
     verdict = Verdict.of(found)
     for warning in filter(None, [found.warning, "" if verdict.grade == "good" else str(verdict)]):
         tell(f"! {warning}")

@@ -20,7 +20,7 @@ from .plate import Plate
 from .result import Design
 from .target import wanted_fractions, with_unused
 
-_WHITE = 1e3 / np.linspace(1e3 / 430, 1e3 / 670, 8)  # nm, equidistant in 1/λ
+WHITE = 1e3 / np.linspace(1e3 / 430, 1e3 / 670, 8)  # nm, equidistant in 1/λ
 _COARSE, _FINE = 3, 6  # pixels along a texel: of the first searches, and of the last
 _FIRST_ITERATIONS, _LAST_ITERATIONS = 75, 400
 _FIXED_FRACTIONS = (0.4, 0.7, 0.9, 1.0)  # of the texels, that are set to levels one round after the other
@@ -109,7 +109,7 @@ def design(
 def _wavelengths(given: float | Sequence[float] | None) -> Array:
     """Return the wavelengths in nm as an array."""
     try:
-        found = _WHITE if given is None else np.atleast_1d(np.asarray(given, np.float64))
+        found = WHITE if given is None else np.atleast_1d(np.asarray(given, np.float64))
     except (TypeError, ValueError):
         found = np.zeros(0)
     if found.ndim != 1 or not found.size or not ((found >= MIN_WAVELENGTH) & (found < np.inf)).all():

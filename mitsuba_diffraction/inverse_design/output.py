@@ -20,7 +20,8 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
 SUFFIXES = (".gsf", ".tif", ".toml", ".png")
-_IMAGE_DESCRIPTION = 270  # tag of TIFF
+_IMAGE_DESCRIPTION, _RESOLUTION, _RESOLUTION_UNIT, _SOFTWARE = 270, (282, 283), 296, 305  # tags of TIFF
+_TO_ASCII = {ord("µ"): "u", ord("×"): "x"}  # of which tags of TIFF consist
 _RECIPE_TOLERANCE = 0.01  # of the recipe; finer tables take minutes, for differences that no picture shows
 _PLOTTED_WAVELENGTHS = np.arange(400.0, 701.0, 10.0)  # nm
 
@@ -37,7 +38,7 @@ def save(design: Design, path: str | os.PathLike[str]) -> tuple[Path, ...]:
     paths = tuple(Path(path).with_suffix(suffix) for suffix in SUFFIXES)
     field, plate = design.height_field, design.plate
     with whole_file(paths[0]) as temporary:
-        temporary.write_bytes(_simple_field(field))
+        temporary.write_bytes(simple_field(field))
     save_tiff(field, plate.height_range, paths[1])
     with whole_file(paths[2]) as temporary:
         temporary.write_text(_recipe(design, paths[0].name), encoding="utf-8")
@@ -61,17 +62,28 @@ def _recipe(design: Design, scan: str) -> str:
 
 
 def save_tiff(field: HeightField, height_range: float, path: str | os.PathLike[str]) -> None:
-    """Write heights as a 16-bit TIFF, `height_range` in µm from black to white, with its scale in the description."""
+    """Write heights as a 16-bit TIFF, `height_range` in µm from black to white.
+
+    Its scale is in the tags of the resolution, in pixels per cm, and in the description as ImageJ writes it: `unit` of
+    lengths, and a straight line from grey levels to heights, c₀ + c₁ g in `vunit`.
+    """
     counts = np.rint(field.heights / height_range * 65535).astype(np.uint16)
-    scale = (
-        f"{MARK}: {field.source}. Pixel size {field.pixel_size[0]:.6g} µm; height {height_range:g} µm from "
-        "black (0) to white (65535); the top row is at the lowest y"
+    description = (
+        f"ImageJ=1.54f\nunit=cm\ncf=0\nc0=0\nc1={height_range / 65535:.10g}\nvunit=um\nmin=0\nmax=65535\n"
+        f"pixel_um={field.pixel_size[0]:.9g}\nheight_range_um={height_range:g}\nrows=from the lowest y\n"
+        f"source={field.source.translate(_TO_ASCII)}\n"
     )
+    tags = {
+        _IMAGE_DESCRIPTION: description,
+        _SOFTWARE: MARK,
+        _RESOLUTION_UNIT: 3,  # cm
+        **{tag: 1e4 / size for tag, size in zip(_RESOLUTION, field.pixel_size, strict=True)},
+    }
     with encoded_file(path) as stream:
-        Image.fromarray(counts).save(stream, "TIFF", tiffinfo={_IMAGE_DESCRIPTION: scale.replace("µ", "u")})
+        Image.fromarray(counts).save(stream, "TIFF", tiffinfo=tags)
 
 
-def _simple_field(field: HeightField) -> bytes:
+def simple_field(field: HeightField) -> bytes:
     """Return the contents of a Gwyddion Simple Field."""
     rows, columns = field.shape
     width, height = (f"{1e-6 * length:.9g}" for length in field.tile_size)

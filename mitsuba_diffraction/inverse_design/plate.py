@@ -12,8 +12,38 @@ from ..settings import MIN_WAVELENGTH, VISIBLE
 from .far_field import Array, blurred_texels
 
 _MAX_TEXELS = 256
+_ORDERS_PER_STROKE = 3.0  # of the finest strokes of a picture; see the eye chart in docs/design.md
+_MAX_ANGLE = 30.0  # degrees, that `for_detail` takes
 _MAX_PATH = 16.0  # largest path difference in wavelengths; deeper reliefs are far outside of scalar theory
 _MARGIN = 1.2  # of the wavelengths of invisible light, by which its spectrum covers more than the design
+
+
+def for_detail(detail: float, texel: float, angle: float, wavelength: float) -> tuple[int, float]:
+    """Return the number of texels, and the angle, that resolve strokes of 1/`detail` of the width of a picture.
+
+    The angle is the given one, unless it takes a larger one for `_MAX_TEXELS` to suffice.
+
+    Args:
+        detail: number of the finest strokes along an edge of the picture.
+        texel: µm.
+        angle: degrees, from the mirror direction to the middle of an edge.
+        wavelength: the longest, nm.
+
+    Raises:
+        ValueError: if no plate resolves them.
+    """
+    if not (is_number(detail) and detail >= 2):
+        raise RequestError(f"detail: got {detail!r}, wanted the number of finest strokes along an edge, at least 2")
+    orders = _ORDERS_PER_STROKE * detail * wavelength * 1e-3 / (2 * texel)  # times sin(angle): texels
+    fitting = math.degrees(math.asin(min(orders / _MAX_TEXELS, 1)))
+    if fitting > max(angle, _MAX_ANGLE):
+        most = 2 * texel * _MAX_TEXELS * math.sin(math.radians(max(angle, _MAX_ANGLE)))
+        raise RequestError(
+            f"detail: got {detail:g}, wanted at most {int(most / (_ORDERS_PER_STROKE * wavelength * 1e-3))} strokes "
+            f"along an edge with texels of {texel:g} µm at {wavelength:.0f} nm"
+        )
+    angle = max(angle, math.ceil(10 * fitting) / 10)
+    return max(4, math.ceil(orders / math.sin(math.radians(angle)))), angle
 
 
 @dataclass(frozen=True, eq=False)

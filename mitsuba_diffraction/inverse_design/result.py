@@ -29,6 +29,7 @@ class Design:
     """A relief and the light that it sends into the bins of the picture, as fractions of all light that leaves it.
 
     Attributes:
+        texels: their heights before the blur of the tool, (texels, texels) µm, rows ↔ +y.
         height_field: one period; rows ↔ +y, as in all height fields.
         plate: the request.
         wanted, predicted: fraction of the light in each bin, (w, bins, bins), rows ↔ +y; `wanted` sums to one at
@@ -38,6 +39,7 @@ class Design:
         interrupted: whether the search was interrupted.
     """
 
+    texels: Array = field(repr=False)
     height_field: HeightField
     plate: Plate = field(repr=False)
     wanted: Array = field(repr=False)
@@ -55,7 +57,7 @@ class Design:
         for name, (depth, blur) in _ERRORS.items():
             relief = _relief(depth * heights, plate, blur)
             changed[name] = _efficiency(_far_field(relief, plate, plate.wavelengths, wanted.shape[1])[0], wanted)
-        return cls(field, plate, wanted, predicted, mirror, changed, interrupted)
+        return cls(heights, field, plate, wanted, predicted, mirror, changed, interrupted)
 
     @property
     def wavelengths(self) -> Array:

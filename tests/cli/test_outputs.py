@@ -17,7 +17,9 @@ from PIL import Image
 import mitsuba_diffraction as md
 from mitsuba_diffraction import outputs
 from mitsuba_diffraction.files import is_intact, refuse_unwritable, seal, whole_file
-from mitsuba_diffraction.inverse_design import output
+from mitsuba_diffraction.inverse_design import Design, makers, output
+from mitsuba_diffraction.inverse_design.plate import Plate
+from mitsuba_diffraction.inverse_design.target import wanted_fractions
 from mitsuba_diffraction.outputs import check_outputs
 from mitsuba_diffraction.render.scene import files_of_scene
 from mitsuba_diffraction.render.spectral_image import SpectralImage, save_preview
@@ -357,6 +359,11 @@ def noise(*shape):
     return np.random.default_rng(0).random(shape, np.float32)
 
 
+def levels():
+    plate = Plate(1.0, 16, 0.6, 17.5, np.array([532.0]), None, 4, 0.1)
+    return Design.of(np.floor(4 * noise(16, 16)) * 0.2, plate, wanted_fractions(np.eye(8), plate))
+
+
 def picture():
     return SpectralImage(np.linspace(400, 700, 8), noise(20, 20, 8))
 
@@ -366,6 +373,7 @@ WRITERS = {
     "picture.exr": lambda path: picture().save(path),
     **{f"preview{suffix}": lambda path: save_preview(picture(), path) for suffix in (".png", ".jpg", ".tif", ".webp")},
     "turn.webp": lambda path: save_animation(["frame.png"] * 2, path),
+    "levels.gds": lambda path: makers.save_gds(levels(), path),
     "relief.tif": lambda path: output.save_tiff(md.gratings.foil(1.5, 0.2, samples=64), 0.2, path),
 }
 

@@ -40,13 +40,28 @@ def test_a_design_is_written_as_relief_recipe_and_picture(command):
     counted = md.read_height_field("plate.tif")  # its description has its scale
     assert counted.heights == pytest.approx(expected.heights, abs=0.8 / 65535)
     assert counted.pixel_size == pytest.approx(expected.pixel_size, rel=1e-5)
-    with Image.open("plate.tif") as tiff:
-        assert "Pixel size 0.0833333 um; height 0.8 um from black (0) to white (65535)" in tiff.tag_v2[270]
     recipe = Recipe.load("plate.toml")
     assert np.array_equal(recipe.height_field().heights, field.heights)
     assert recipe.settings.coherence_length == 6
     # Files of the package may be replaced.
     check_outputs([], [("-o", path) for path in Path().glob("plate.*")])
+
+
+def test_files_for_makers_are_written(command):
+    code, said, _ = command(
+        f"design flag.png {OPTIONS} --levels 4 --export stl --export master --export gds -o step.gsf"
+    )
+    assert code == 0
+    for name in ("step.stl", "step_master.gsf", "step.gds"):
+        assert Path(name).stat().st_size > 1000
+        assert f"\n{name}: " in said
+    check_outputs([], [("-o", path) for path in Path().glob("step*")])
+
+
+def test_texels_follow_from_the_detail(command):
+    code, _, error = command("design flag.png --texel 1 --wavelength 532 --starts 1 --detail 4")
+    assert code == 0
+    assert "note: 11 texels along the period, angle 17.5°, for strokes of 1/4 of the picture" in error
 
 
 def test_a_target_is_a_picture_as_seen_on_a_screen():
@@ -135,6 +150,9 @@ def test_an_interrupted_command_writes_the_best_so_far(command, monkeypatch):
         ("flag.png -o flag.gsf", "-o: got flag.png, which is read"),
         ("flag.png --wavelength red", "--wavelength: got 'red', wanted a number"),
         ("flag.png --texel 0.2", "texel: got 0.2 µm, wanted more than half the wavelength"),
+        ("flag.png --detail 8 --texels 12", "--detail: got 8 and --texels 12, wanted one of them"),
+        ("flag.png --export obj", "--export: got 'obj', wanted one of stl, gds, master"),
+        ("flag.png --export gds", "--export gds: got continuous heights, wanted levels (--levels)"),
         ("flag.png --levels 1", "levels: got 1, wanted a whole number of at least 2"),
     ],
 )

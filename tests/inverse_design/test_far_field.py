@@ -9,7 +9,7 @@ import scipy.ndimage
 
 from mitsuba_diffraction.inverse_design.build import far_field_of
 from mitsuba_diffraction.inverse_design.far_field import blurred_texels, lobes_in_bins, nearest_levels
-from mitsuba_diffraction.inverse_design.plate import Plate
+from mitsuba_diffraction.inverse_design.plate import Plate, for_detail
 from mitsuba_diffraction.inverse_design.target import wanted_fractions, with_unused
 from mitsuba_diffraction.reference import order_powers
 from mitsuba_diffraction.settings import lobe_width
@@ -119,3 +119,22 @@ def test_light_that_colours_cannot_use_may_go_into_the_mirror_direction():
     y, x = np.meshgrid(*2 * [(one.edges(spare.shape[1])[1:] + one.edges(spare.shape[1])[:-1]) / 2], indexing="ij")
     assert spare[0][np.hypot(x, y) < 2 * one.pitch].sum() > 0.9 * spare[0].sum()
     assert with_unused(wanted, plate()) is wanted
+
+
+@pytest.mark.parametrize("detail", [4, 12, 44, 70])
+def test_a_detail_has_three_orders(detail):
+    texels, angle = for_detail(detail, 0.8, 17.5, 532.0)
+    assert texels <= 256
+    assert 17.5 <= angle <= 30
+    orders = 2 * np.sin(np.deg2rad(angle)) * texels * 0.8 / 0.532
+    assert 3 * detail <= orders < 3 * detail * 1.02 + 2
+    assert angle == 17.5 or texels > 250
+
+
+def test_finer_detail_than_a_plate_resolves_is_refused():
+    with pytest.raises(ValueError, match="detail: got 500, wanted at most 128 strokes along an edge"):
+        for_detail(500, 0.8, 17.5, 532.0)
+    with pytest.raises(
+        ValueError, match="detail: got 1, wanted the number of finest strokes along an edge, at least 2"
+    ):
+        for_detail(1, 0.8, 17.5, 532.0)

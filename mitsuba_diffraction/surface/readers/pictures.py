@@ -66,8 +66,7 @@ def _load_array(file: IO[bytes]) -> NDArray:
         raise RequestError(f"not an array that can be read ({error})") from None
 
 
-_LENGTH = r"(\d+\.?\d*(?:e[-+]?\d+)?)"
-_OWN_SCALE = re.compile(rf"Pixel size {_LENGTH}(?: [×x] {_LENGTH})? [uµ]m; height {_LENGTH} [uµ]m from black")
+_HEIGHT_RANGE = re.compile(r"^height_range_um=(\d+\.?\d*(?:e[-+]?\d+)?)$", re.MULTILINE)
 MAX_ANNOTATION_FRACTION = 0.25  # of pixels that are coloured, such as a scale bar; a colour map has more
 
 
@@ -107,12 +106,15 @@ def read(path: Path) -> Scan:
 
 
 def _own_scale(picture: Image.Image) -> tuple[tuple[float, float] | None, float | None]:
-    """Return pixel size and height range, µm, of a TIFF that this package wrote, as its description has them."""
-    description = str(picture.tag_v2.get(270, "")) if picture.format == "TIFF" else ""
-    if not (description.startswith(MARK) and (found := _OWN_SCALE.search(description))):
+    """Return pixel size and height range, µm, of a TIFF that this package wrote (`inverse_design/output.py`)."""
+    if picture.format != "TIFF" or picture.tag_v2.get(305) != MARK:
         return None, None
-    x, y, height = found.groups()
-    return (float(x), float(y or x)), float(height)
+    found = _HEIGHT_RANGE.search(str(picture.tag_v2.get(270, "")))
+    resolution = [float(picture.tag_v2.get(tag, 0)) for tag in (282, 283)]
+    if found is None or picture.tag_v2.get(296) != 3 or min(resolution) <= 0:
+        return None, None
+    # Pixels per cm.
+    return (1e4 / resolution[0], 1e4 / resolution[1]), float(found[1])
 
 
 def _numbers_of(picture: Image.Image) -> NDArray:

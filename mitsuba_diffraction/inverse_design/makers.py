@@ -1,0 +1,129 @@
+"""Files for makers of a relief: a mesh, the layers of its levels, and the master of a mould."""
+
+from __future__ import annotations
+
+import errno
+import os
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from ..errors import RequestError
+from ..files import whole_file
+from ..outputs import MARK
+from ..surface.heightfield import HeightField
+from .far_field import Array
+from .output import simple_field
+from .result import Design
+
+_STL_FACE = np.dtype([("normal", "<f4", 3), ("corners", "<f4", (3, 3)), ("attribute", "<u2")])
+_END_OF_GDS = bytes([0, 4, 4, 0])  # the record ENDLIB
+_BASE = 1.0  # µm, of the solid below the lowest point
+
+
+def save_stl(field: HeightField, path: str | os.PathLike[str]) -> None:
+    """Write one period as a closed solid, a binary STL in µm: the relief over pixel centres, on a base of 1 µm.
+
+    The first row and column are repeated at the end, so that periods fit each other.
+    """
+    heights = np.pad(field.heights - field.heights.min() + _BASE, ((0, 1), (0, 1)), mode="wrap")
+    axes = [np.arange(n) * size for n, size in zip(heights.shape, field.pixel_size[::-1], strict=True)]
+    y, x = np.meshgrid(*axes, indexing="ij")
+    top, bottom = np.stack([x, y, heights], axis=-1), np.stack([x, y, np.zeros_like(x)], axis=-1)
+    strips = [np.stack([low, high]) for low, high in ((bottom[0], top[0]), (top[-1], bottom[-1]))]
+    strips += [np.stack([low, high]) for low, high in ((top[:, 0], bottom[:, 0]), (bottom[:, -1], top[:, -1]))]
+    corners = np.concatenate([_triangles(grid) for grid in (top, bottom[::-1], *strips)])
+    faces = np.zeros(len(corners), _STL_FACE)
+    normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+    faces["normal"] = normals / np.maximum(np.linalg.norm(normals, axis=-1, keepdims=True), 1e-30)
+    faces["corners"] = corners
+    header = f"{MARK}; one period, um".encode("ascii").ljust(80)
+    with whole_file(path) as temporary:
+        temporary.write_bytes(header + np.uint32(len(faces)).astype("<u4").tobytes() + faces.tobytes())
+
+
+def _triangles(points: Array) -> Array:
+    """Return the two triangles of each cell of a grid of points, (rows, columns, 3): (n, 3, 3)."""
+    a, b, c, d = points[:-1, :-1], points[:-1, 1:], points[1:, 1:], points[1:, :-1]
+    return np.concatenate([np.stack(corners, axis=-2).reshape(-1, 3, 3) for corners in ((a, b, c), (a, c, d))])
+
+
+def save_gds(design: Design, path: str | os.PathLike[str]) -> None:
+    """Write the texels of one period as GDSII in µm: those of level k on layer k, none for level 0.
+
+    Raises:
+        ValueError: if the heights are not levels, or gdstk is not installed.
+    """
+    levels = design.plate.levels
+    if levels is None:
+        raise RequestError("--export gds: got continuous heights, wanted levels (--levels)")
+    gdstk = _gdstk()
+    library = gdstk.Library(name="RELIEF", unit=1e-6, precision=1e-9)
+    cell, texel = library.new_cell("PERIOD"), design.plate.texel
+    steps = np.rint(design.texels / design.plate.height_range * (levels - 1)).astype(int)
+    for row, line in enumerate(steps):
+        starts = np.flatnonzero(np.diff(line, prepend=-1))
+        for start, end in zip(starts, [*starts[1:], len(line)], strict=True):
+            if line[start] > 0:
+                corners = (start * texel, row * texel), (end * texel, (row + 1) * texel)
+                cell.add(gdstk.rectangle(*corners, layer=int(line[start])))
+    cell.add(gdstk.Label(MARK, (0, 0), layer=0))
+    with whole_file(path) as temporary:
+        library.write_gds(temporary)
+        if not temporary.read_bytes().endswith(_END_OF_GDS):  # gdstk ignores a full disk
+            raise OSError(errno.EIO, "only a part could be written; the disk may be full")
+
+
+def check_gds(levels: int | None) -> None:
+    """Raise RequestError if a GDSII file cannot be written, before the search."""
+    if levels is None:
+        raise RequestError("--export gds: got continuous heights, wanted levels (--levels)")
+    _gdstk()
+
+
+def _gdstk() -> Any:
+    try:
+        import gdstk
+    except ModuleNotFoundError:
+        raise RequestError("--export gds: gdstk is not installed; pip install 'mitsuba_diffraction[gds]'") from None
+    return gdstk
+
+
+def save_master(design: Design, path: str | os.PathLike[str]) -> None:
+    """Write the master of a mould as .gsf: its copies, turned over, are the relief."""
+    field = design.height_field
+    heights = design.plate.height_range - field.heights[:, ::-1]
+    master = HeightField(heights, field.pixel_size, f"master of {field.source}")
+    with whole_file(path) as temporary:
+        temporary.write_bytes(simple_field(master))
+
+
+EXPORTS = {
+    "stl": (".stl", "one period as a closed solid, in µm, on a base of 1 µm"),
+    "gds": (".gds", "one period, the texels of level k on layer k"),
+    "master": ("_master.gsf", "the master of a mould, mirrored and upside down"),
+}
+"""By name: how its file ends, and what is in it."""
+
+
+def export_paths(names: list[str], path: Path) -> dict[str, Path]:
+    """Return the file of each export beside the relief in `path`.
+
+    Raises:
+        ValueError: on an unknown name.
+    """
+    if unknown := [name for name in names if name not in EXPORTS]:
+        raise RequestError(f"--export: got {unknown[0]!r}, wanted one of {', '.join(EXPORTS)}")
+    return {name: path.with_name(path.stem + EXPORTS[name][0]) for name in dict.fromkeys(names)}
+
+
+def export(design: Design, paths: dict[str, Path]) -> None:
+    """Write the files of `export_paths`."""
+    for name, path in paths.items():
+        if name == "stl":
+            save_stl(design.height_field, path)
+        elif name == "gds":
+            save_gds(design, path)
+        else:
+            save_master(design, path)
