@@ -90,6 +90,7 @@ FIGURES = (
         5,
     ),
     Figure(("design.png",), "mitsuba-diffraction design precompute/designed/cat.png -o {out}/design.gsf"),
+    Figure(("eye_chart.png",), "python docs/eye_chart.py {out}/eye_chart.png"),
     Figure(
         ("efficiencies.png",),
         """mitsuba-diffraction efficiency ruled,lines_per_mm=1200 --theory rigorous --material Al --angle 17.5 \

@@ -22,6 +22,8 @@ from ..progress import progress_bar, say, show, table, tell
 from .arguments import Overwrite, check_suffix, numbers
 from .render import Stopped
 
+_MIN_SAID_TIME = 90.0  # s, that a search takes
+
 
 def design(
     target: Annotated[Path, typer.Argument(metavar="TARGET.png", help="the picture to cast, grey or RGB")],
@@ -101,6 +103,7 @@ def design(
             starts=starts,
             seed=seed,
             progress=progress,
+            expect=_say_time,
         )
     paths = save(found, path)
     makers.export(found, exports)
@@ -121,6 +124,11 @@ def design(
         tell(str(verdict))
     if found.interrupted:
         raise Stopped(f"{relief} holds the best relief so far")
+
+
+def _say_time(seconds: float) -> None:
+    if seconds > _MIN_SAID_TIME:
+        say("note", f"about {seconds / 60:.0f} min; Ctrl-C ends the search and keeps the best relief so far")
 
 
 def read_target(path: Path, invert: bool = False) -> NDArray[np.float64]:

@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+import time
+from collections.abc import Callable, Sequence
 
 import numpy as np
 import scipy.fft
@@ -24,6 +25,7 @@ WHITE = 1e3 / np.linspace(1e3 / 430, 1e3 / 670, 8)  # nm, equidistant in 1/λ
 _COARSE, _FINE = 3, 6  # pixels along a texel: of the first searches, and of the last
 _FIRST_ITERATIONS, _LAST_ITERATIONS = 75, 400
 _FIXED_FRACTIONS = (0.4, 0.7, 0.9, 1.0)  # of the texels, that are set to levels one round after the other
+_LOSSES_PER_ITERATION = 1.1
 _CORRECTIONS, _TOLERANCE = 20, 1e-8  # of L-BFGS-B: stored steps, and the decrease of L at which it ends
 
 
@@ -44,6 +46,7 @@ def design(
     starts: int = 24,
     seed: int = 0,
     progress: Progress = silent,
+    expect: Callable[[float], None] = lambda seconds: None,
 ) -> Design:
     """Compute a relief that casts a picture, for light along its normal.
 
@@ -70,6 +73,7 @@ def design(
         starts: random reliefs from which the search begins; the best of them is continued.
         seed: of the random reliefs.
         progress: called with (iterations done, iterations in all).
+        expect: called once, before the search, with the seconds that it will take on this machine, about.
 
     Returns:
         The relief and its predicted far field. After a KeyboardInterrupt it is the best so far (`Design.interrupted`).
@@ -92,7 +96,7 @@ def design(
     check_whole("starts", starts, 1)
     check_whole("seed", seed, 0)
     wanted = wanted_fractions(target, plate)
-    search = _Search(plate, with_unused(wanted, plate), starts, progress)
+    search = _Search(plate, with_unused(wanted, plate), starts, progress, expect)
     interrupted = False
     try:
         search(seed)
@@ -131,10 +135,20 @@ def far_field_of(
     return FarField(plate.spread(per_texel), plate.kappa, np.array(lobes, dtype), wanted.astype(dtype))
 
 
+def _seconds(far_field: FarField, heights: Array) -> float:
+    """Return how long one evaluation of the loss takes."""
+    begin = time.perf_counter()
+    far_field.loss(heights)
+    return time.perf_counter() - begin
+
+
 class _Search:
     """The search for the heights of the texels; an exception, such as KeyboardInterrupt, loses nothing."""
 
-    def __init__(self, plate: Plate, wanted: Array, starts: int, progress: Progress) -> None:
+    def __init__(
+        self, plate: Plate, wanted: Array, starts: int, progress: Progress, expect: Callable[[float], None]
+    ) -> None:
+        self._expect = expect
         self._plate, self._wanted, self._starts = plate, wanted, starts
         self._progress, self._done, self._total = progress, 0, starts * 2 * _FIRST_ITERATIONS + _LAST_ITERATIONS
         # Loss and heights of the best relief of each start.
@@ -152,6 +166,8 @@ class _Search:
             far_field_of(self._plate, self._wanted, scale * self._plate.coherence_length, per_texel)
             for scale, per_texel in ((0.5, _COARSE), (1.0, _COARSE), (1.0, _FINE))
         )
+        coarse, exact = (_seconds(far_field, self.heights) for far_field in (own, fine))
+        self._expect(_LOSSES_PER_ITERATION * (self._starts * 2 * _FIRST_ITERATIONS * coarse + _LAST_ITERATIONS * exact))
         random = np.random.default_rng(seed)
         for _ in range(self._starts):
             heights = self._minimised(wide, self._random_relief(random), _FIRST_ITERATIONS)

@@ -154,6 +154,18 @@ def test_a_search_among_levels_beats_rounding(laser):
     assert stepped.efficiency[0] > 1.1 * rounded.efficiency[0]
 
 
+def test_the_time_of_a_search_is_told_before_it(monkeypatch):
+    told = []
+    monkeypatch.setattr("mitsuba_diffraction.inverse_design.build._seconds", lambda *_: 0.01)
+
+    def stop(done, total):
+        assert len(told) == 1
+        raise KeyboardInterrupt
+
+    md.design(lopsided(), wavelengths=532, texel=1.0, texels=16, starts=4, progress=stop, expect=told.append)
+    assert told == pytest.approx([0.011 * (4 * 150 + 400)])
+
+
 def test_an_interrupted_design_is_the_best_so_far(laser):
     def stop(done, total):
         assert total == 1300
