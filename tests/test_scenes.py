@@ -23,6 +23,7 @@ SCENES = ROOT / "scenes"
 sys.path.insert(0, str(SCENES))
 
 import anodised  # noqa: E402
+import beetle  # noqa: E402
 import disc  # noqa: E402
 import foil  # noqa: E402
 import ground  # noqa: E402
@@ -119,6 +120,7 @@ def small_scenes(tmp_path_factory):
     ground.make(models, size=256)
     hologram.make(models, hologram.PICTURE, np.array(hologram.LIGHT), np.array(hologram.EYE), count=32)
     anodised.make(models, columns=64)
+    beetle.make(models, columns=90)
     return scenes
 
 
@@ -132,6 +134,7 @@ PICTURES = [
     ("hologram", {}),
     ("hologram", {"card": "clear"}),
     ("anodised", {}),
+    ("beetle", {}),
     ("rainbow", {}),
     ("window", {}),
 ]
@@ -180,6 +183,37 @@ def test_stripes_of_the_hologram_diffract_their_colours_from_the_lamp_to_the_eye
     kappa = 2 * np.pi * (to_light[:, 2] + to_eye[:, 2]) / wavelength
     fraction = j1(kappa * heights * hologram.DEPTH / 2) ** 2
     np.testing.assert_allclose(fraction / 0.3386, brightness.ravel(), atol=2e-3)
+
+
+# ---------------------------------------------------------------- the beetle
+
+
+def test_beetle_stands_on_the_ground_with_its_elytra_apart():
+    left, right = beetle.elytron(90, 1), beetle.elytron(90, -1)
+    np.testing.assert_allclose(right[0][::-1] * [1, -1, 1], left[0], atol=1e-12)
+    assert left[0][..., 1].min() > 0
+    lowest = [points[..., 2].min() for points, _, _ in beetle.body()]
+    # Six legs touch it, and nothing else does.
+    assert min(lowest) > -0.01
+    assert sum(z < 0.02 for z in lowest) == 6
+    for points, u, v in (left, right, beetle.pronotum(90)):
+        assert min(np.diff(u).min(), np.diff(v).min()) > 0
+        outwards = points - [0, 0, beetle.AXIS / 2]
+        outwards[..., 0] = 0
+        normal = np.cross(np.gradient(points, axis=1), np.gradient(points, axis=0))
+        assert np.mean((normal * outwards).sum(-1) > 0) > 0.97
+
+
+def test_stripes_of_the_beetle_reflect_at_700_nm_and_the_rest_at_530_nm():
+    text = (SCENES / "beetle.xml").read_text()
+    for name, wanted in (("ior", (1.7, 1.6)), ("thickness", [0.53 / (4 * n) for n in (1.7, 1.6)])):
+        found = re.findall(rf'thin_film_{name}" value="8 x \(([\d.]+), ([\d.]+)\)"', text)
+        assert len(found) == 2
+        np.testing.assert_allclose(np.array(found, float), [wanted] * 2, rtol=1e-3)
+    factor = beetle.stripes(*np.meshgrid(np.linspace(0.2, 0.9, 50), np.linspace(0, 1, 501)))
+    assert factor.min() == 1
+    assert factor.max() == pytest.approx(0.7 / 0.53)
+    assert 0.15 < np.mean(factor > 1.3) < 0.35
 
 
 # ---------------------------------------------------------------- the snake

@@ -169,7 +169,17 @@ def test_the_documentation_names_the_scenes_that_request_denoising():
     requesting = {path.name for path in scenes.glob("*.xml") if is_requested(path)}
     assert requesting == {
         f"{name}.xml"
-        for name in ("glasses", "window", "rainbow", "compact_disc", "hologram", "anodised", "blaze", "projection")
+        for name in (
+            "glasses",
+            "window",
+            "rainbow",
+            "compact_disc",
+            "hologram",
+            "anodised",
+            "beetle",
+            "blaze",
+            "projection",
+        )
     }
 
 
