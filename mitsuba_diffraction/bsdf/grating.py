@@ -335,7 +335,7 @@ class Grating:
         return covered, replaced
 
     def transmittance(self, si: mi.SurfaceInteraction3f, cos: mi.Float, active: mi.Bool) -> mi.UnpolarizedSpectrum:
-        """Return T of a plane, times that of the coat, at the cosine of an angle outside."""
+        """Return T of a plane, times T of the coat, at the cosine of an angle outside."""
         transmitted = self._powers(si, cos, active)[1]
         return transmitted if self.coat is None else (1 - self.coat.reflectance(si, cos)) * transmitted
 

@@ -31,7 +31,7 @@ from .precompute import precompute
 from .render import Stopped, render
 from .view import view
 
-# Click's, or that of the copy of Click which newer versions of Typer carry.
+# Click's class, or the class of the copy of Click which newer versions of Typer carry.
 _UsageError: Any = typer.BadParameter.__base__
 
 

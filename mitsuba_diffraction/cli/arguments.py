@@ -132,7 +132,7 @@ def materials_of(texts: Sequence[str] | None) -> dict[str, dict[str, Value]]:
 
 
 def is_film(source: str) -> bool:
-    """Return whether a profile, or that of a recipe, is a transparent film."""
+    """Return whether a profile, or the profile of a recipe, is a transparent film."""
     profile = Recipe.load(source).surface.get("profile", "") if source.lower().endswith(".toml") else source
     return profile == "film" or profile.startswith("transmission_")
 
@@ -199,7 +199,7 @@ def given_of(context: typer.Context, names: Iterable[str]) -> dict[str, Any]:
 
 
 def recipe_of(source: Path, of_scan: dict[str, Any], settings: dict[str, Any], extent: str = "sample") -> Recipe:
-    """Return the recipe in a file, or that of a scan; `settings` override those of a file and the extent of a scan.
+    """Return the recipe in a file, or a recipe of a scan; `settings` override a file's settings and a scan's extent.
 
     Scans are samples by default, as they are rarely cut to whole periods.
     """

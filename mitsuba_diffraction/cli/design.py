@@ -134,7 +134,7 @@ def _say_time(seconds: float) -> None:
 def read_target(path: Path, invert: bool = False) -> NDArray[np.float64]:
     """Return linear radiance from 0 to 1, (rows, columns) or (rows, columns, 3), of a picture in sRGB.
 
-    What is transparent is dark. With `invert`, the radiance is that of the negative, where the picture is opaque.
+    What is transparent is dark. With `invert`, what is opaque has the radiance of the negative.
 
     Raises:
         FileNotFoundError: if there is no such file.
@@ -168,7 +168,7 @@ def read_target(path: Path, invert: bool = False) -> NDArray[np.float64]:
 
 
 def _is_dark_on_light(picture: NDArray[np.float64]) -> bool:
-    """Return whether most of the edge of a picture is bright, as that of a sheet of paper."""
+    """Return whether most of the edge of a picture is bright, as on a sheet of paper."""
     grey = picture if picture.ndim == 2 else picture.mean(axis=-1)
     edge = np.concatenate([grey[0], grey[-1], grey[:, 0], grey[:, -1]])
     return bool(np.median(edge) > grey.max() / 2)

@@ -142,7 +142,7 @@ def render(
         size = 1 if not _is_spectral(target) else 4 if single and not rgb else 2
         request["announce"] = partial(_announce, scene.name, size, 3 + alpha, written, named)
     pictures = _pictures(target, frames)
-    # By default the exposure of the first picture is that of all.
+    # By default all pictures have the exposure of the first.
     factor = None if exposure is None else 2**exposure
     with durations():
         for number, (path, motion) in enumerate(zip(pictures, motions, strict=True)):
@@ -171,8 +171,8 @@ def _announce(
     """Print what a rendering of more than a minute needs.
 
     Args:
-        planes: of the picture, in addition to those of its `wavelengths` (None: all).
-        named: the sample count, if it is that of the scene.
+        planes: of the picture, in addition to one for each of its `wavelengths` (None: all).
+        named: the sample count, if the scene names it.
     """
     if estimate.seconds < _MIN_ANNOUNCED_SECONDS:
         return
@@ -231,7 +231,7 @@ def _preview(path: Path) -> Path:
 
 
 def _pictures(target: Path, frames: int | None) -> list[Path]:
-    """Return the paths of the pictures: `target`, or those of its frames, `target_007.exr`."""
+    """Return the paths of the pictures: `target`, or the paths of its frames, `target_007.exr`."""
     if frames is None:
         return [target]
     digits = max(3, len(str(frames - 1)))

@@ -57,7 +57,7 @@ def view(
     target = output or Path(stem if len(requests) == 1 else "surfaces").with_suffix(".html")
     check_suffix("-o", target, ".html")
     of_scan, settings = options_of_scan(context), settings_of(context)
-    # Beside a scan, its options are not those of the other surfaces.
+    # The options of a scan do not apply to the other surfaces.
     has_scan = any(is_scan(name) for name, _ in requests)
     recipes = [
         recipe_of(Path(name), of_scan, settings) if is_scan(name) or ((of_scan or settings) and not has_scan) else None
@@ -83,7 +83,7 @@ def view(
 
 
 def _surface(context: typer.Context, name: str, parameters: dict[str, Any], recipe: Recipe | None) -> Surface:
-    """Return the surface of one argument; the recipe is that of a scan, or of other settings."""
+    """Return the surface of one argument; a recipe is given for a scan, or for other settings."""
     path, progress = Path(name), functools.partial(progress_bar, unit="%")
     if is_film(name):
         say(

@@ -332,7 +332,7 @@ def min_kappa(spectrum: PowerSpectrum, index: float, height_scale: float = 1.0, 
 def small_kappas(spectrum: PowerSpectrum, index: float, lateral_scale: float = 1.0) -> tuple[float, float]:
     """Return the two bounds whose minimum is κ₁, in rad/µm.
 
-    The first is a quarter of the first interval of the table, where its error is as small as that of the linear
+    The first is a quarter of the first interval of the table, where its error is as small as the error of the linear
     extrapolation. The second, to be multiplied by the ratio h/s of the scales of heights and lengths, is 0.8 of the
     minimum κ of undiffracted light at normal incidence; the longest wavelength is λ/s, with the minimum s. Wavelengths
     of the spectrum are those in the denser medium.

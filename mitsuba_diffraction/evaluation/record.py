@@ -74,7 +74,7 @@ class Check:
     """A function that returns a record: one row of the table, and one test.
 
     Attributes:
-        group, name, source: as of `Record`.
+        group, name, source: see `Record`.
         measure: measures under the current variant of Mitsuba; its record lacks these three.
         slow: takes more than three seconds.
     """

@@ -197,8 +197,8 @@ def changes(
 ) -> tuple[Change, ...]:
     """Compute two changes of each kind, + and −; of the tip only if the surface was measured.
 
-    A blunter and a sharper tip have equal effects on a surface that is equal to its negative, such as a sinusoid or a
-    sawtooth: one widens the ridges, the other the grooves, and h and −h have the same powers.
+    If h and −h have the same shape (sinusoid, sawtooth), a blunter and a sharper tip change the colours equally: one
+    widens the ridges, the other the grooves.
 
     Height scale and pixel size scale the arguments of the spectrum (`radiance`). The tip changes the surface, whose
     periods and spectrum are computed again, by `build`, with the same settings. The spectrum must be valid for

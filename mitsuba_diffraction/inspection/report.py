@@ -35,7 +35,7 @@ class Inspection:
         height_field: the surface.
         extent: "tile" or "sample".
         statistics: heights, slopes, tilt.
-        periods: as of `find_periods`, strongest first; empty if none is significant.
+        periods: see `find_periods`; strongest first, empty if none is significant.
         max_coherence_length: what a scan supports, µm, at most that of sunlight; a tile supports any.
         coherence_length: the requested one, limited to `max_coherence_length`, µm.
         standard_error: of the spectrum of a sample at that coherence length, a fraction of the reflected power; None of
@@ -62,7 +62,7 @@ class Inspection:
 
     @property
     def direction(self) -> float:
-        """The direction, in degrees, of the plane in which colours are shown: that of the main period, else x."""
+        """The direction, in degrees, of the plane in which colours are shown: along the main period, else along x."""
         return self.periods[0].direction if self.periods else 0.0
 
     def as_json(self) -> dict[str, object]:

@@ -21,9 +21,9 @@ MANUAL = f"""Path tracer that also samples the light that gratings cast onto oth
 Parameters (XML or dictionary):
 {listed(PARAMETERS)}
 
-The picture converges to that of `path` with the same parameters. A path tracer finds a small or distant light via a
-grating only by chance, so that the light that gratings cast onto a wall appears as fireflies. Here those paths are
-traced from the light, and all others from the eye.
+The picture converges to the picture by `path` with the same parameters. A path tracer finds a small or distant light
+via a grating only by chance, so that the light that gratings cast onto a wall appears as fireflies. Here those paths
+are traced from the light, and all others from the eye.
 
 With L a light, G a vertex on a surface whose BSDF is or contains a `diffraction_grating` (whichever component of it
 reflects or transmits the light: both sides of `twosided` and of a film, all of a blend, the base), X a vertex on any
@@ -52,8 +52,8 @@ without extent is not seen in a mirror: it is omitted where the grating next to 
 
 Without a grating, with max_depth of 0 to 2, in polarised variants, and for sensors other than `perspective` and
 `thinlens`, this is `path`. Instances and curves count as X. hide_emitters, and films with sample_border, are refused.
-It can be nested in `aov`. Gradients are those of `path` (forward) and `prb` (backward), and single rays (`sample`)
-those of `path`.
+It can be nested in `aov`. Gradients are computed by `path` (forward) and `prb` (backward), single rays (`sample`) by
+`path`.
 """
 
 
@@ -110,8 +110,8 @@ def define() -> type:
             _add_light_paths(sensor, light, seed)
             return sensor.film().develop() if develop else mi.TensorXf()
 
-        # Dr.Jit does not differentiate splats: derivatives are those of `path`, which has the same expectation. `prb`
-        # gives them backward; forward it fails in spectral variants of Mitsuba 3.9.1, where that of `path` does not.
+        # Dr.Jit does not differentiate splats. Derivatives are taken of `path` instead, which has the same expectation:
+        # backward by `prb`; forward by `path` itself, as `prb` fails there in spectral variants of Mitsuba 3.9.1.
 
         def render_forward(
             self, scene: mi.Scene, params: object, sensor: mi.Sensor, seed: mi.UInt32 | int = 0, spp: int = 0
@@ -137,7 +137,7 @@ def define() -> type:
 
 
 def _lit_gratings(scene: mi.Scene, sensor: mi.Sensor, max_depth: int) -> Gratings | None:
-    """Return the gratings from which light is traced; None if all paths are those of `path`.
+    """Return the gratings from which light is traced; None if all paths are traced as in `path`.
 
     Raises:
         ValueError: if the film takes samples outside its edge (`sample_border`).

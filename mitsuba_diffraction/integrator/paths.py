@@ -133,7 +133,7 @@ def define_eye_paths() -> type:
         ) -> tuple[mi.Spectrum, mi.Bool, list[mi.Float]]:
             ctx = mi.BSDFContext()
             si = scene.ray_intersect(ray, active)
-            # Alpha is that of `path`: null interactions are transparent, an environment is not.
+            # Alpha is the same as in `path`: null interactions are transparent, an environment is not.
             valid = mi.Bool(scene.environment() is not None)
             result = si.emitter(scene).eval(si, active)
             ray = mi.Ray3f(ray)

@@ -156,7 +156,7 @@ class _Search:
 
     @property
     def heights(self) -> Array:
-        """Those of the smallest loss so far, (texels, texels) µm."""
+        """The heights with the smallest loss so far, (texels, texels) µm."""
         flat = np.zeros(2 * (self._plate.texels,))
         return min(self._found, key=lambda pair: pair[0], default=(0.0, flat))[1]
 

@@ -1,6 +1,6 @@
-"""The far field of a relief of square texels, its distance from the wanted one, and the gradient of that.
+"""The far field of a relief of square texels, its distance from the wanted one, and the gradient of this distance.
 
-z = U h Uᵀ                                   heights of the pixels, from those of the texels, h (`blurred_texels`)
+z = U h Uᵀ                                   heights of the pixels, from the heights of the texels, h (`blurred_texels`)
 η_m = |F_m|²,  F = fft2(e^{iκz})/N           power of each order, for light along the normal
 P = A_y η A_xᵀ                               power in each bin of direction cosines (`lobes_in_bins`)
 L_λ = Σ (P − t)²/s                           t the wanted fraction of the light, Σ over bins
@@ -65,7 +65,7 @@ class FarField:
         texels: U, (pixels, texels).
         kappa: κ of each wavelength, (w,) rad/µm.
         lobes: A of each wavelength, (w, bins, pixels), orders as in `scipy.fft.fftfreq`, the same along x and y. Its
-            precision is that of the FFTs.
+            precision determines the precision of the FFTs.
         wanted: t, (w, bins, bins), rows ↔ +y; sums to one at most for each wavelength.
     """
 

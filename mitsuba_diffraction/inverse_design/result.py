@@ -96,7 +96,7 @@ class Design:
 
     @property
     def _judged(self) -> NDArray[np.bool_]:
-        """The bins of the frame without those of order 0, if the plate sends unused light there, (bins, bins)."""
+        """The bins of the frame, (bins, bins); without the bins of order 0, if the plate sends unused light there."""
         edges = self.plate.edges(self.wanted.shape[1])
         middles = (edges[1:] + edges[:-1]) / 2
         lobe = _LOBE * float(self.wavelengths.max()) * 1e-3 * lobe_width(self.plate.coherence_length)
@@ -138,7 +138,7 @@ class Design:
     def efficiencies(self, wavelengths: Array) -> Array:
         """Return the fraction of the light in the target at other wavelengths in nm, (n,).
 
-        The target is that of the nearest wavelength of the design.
+        At each wavelength the target of the nearest wavelength of the design is used.
         """
         nearest = np.abs(np.subtract.outer(wavelengths, self.wavelengths)).argmin(axis=1)
         predicted = _far_field(self.height_field, self.plate, wavelengths, self.wanted.shape[1])[0]
@@ -157,7 +157,7 @@ def _relief(heights: Array, plate: Plate, blur_scale: float = 1.0) -> HeightFiel
 def _far_field(relief: HeightField, plate: Plate, wavelengths: Array, bins: int) -> tuple[Array, Array]:
     """Return the fractions of the light in the bins, (w, bins, bins), and in order 0, (w,).
 
-    The orders are those of the BSDF, each at its own κ, with K G or, of a sheet, K_t G_t (1 − F).
+    Orders have the powers of the BSDF, each at its own κ, with K G or, for a sheet, K_t G_t (1 − F).
     """
     powers = tile_powers(relief, float(wavelengths.min()) * 1e-3)
     edges, predicted, mirror = plate.edges(bins), [], []

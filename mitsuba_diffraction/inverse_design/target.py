@@ -19,8 +19,8 @@ def wanted_fractions(target: ArrayLike, plate: Plate) -> Array:
     """Return t, the wanted fraction of the light in each bin, (w, bins, bins), rows ↔ +y.
 
     Pixels are squares: the longer edge of the picture fills the frame, and the rest of it is dark. Colours are
-    reflectances ρ(λ) of the light of a lamp (`upsampled`), t = ρ/max Σ ρ over the wavelengths: of one wavelength all
-    light is wanted in the picture, of grey pictures that of all.
+    reflectances ρ(λ) of the light of a lamp (`upsampled`), t = ρ/max Σ ρ over the wavelengths: with one wavelength all
+    of its light is wanted in the picture; in a grey picture the light of all wavelengths is.
 
     Raises:
         ValueError: if the target is not a picture, is black, or lies in the mirror direction.

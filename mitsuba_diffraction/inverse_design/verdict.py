@@ -85,5 +85,5 @@ def _remedy(design: Design) -> str:
 
 
 def _depth(plate: Plate) -> float:
-    """Return the depth in µm that is a path difference of one wavelength, the mean of those of the design."""
+    """Return the depth in µm with a path difference of one wavelength, on average over the wavelengths."""
     return float(2 * np.pi / np.abs(plate.kappa).mean())

@@ -1,8 +1,8 @@
 """Rendering on an existing Dask cluster (the extra `cluster`).
 
 Each band of a pass is a task. A worker loads the scene once per rendering and traces one task at a time with all of its
-threads. Results are added in the order of the passes, so that the sum is identical, bit for bit, to that of a single
-machine. At most two tasks per initial worker are in flight. Dask reassigns those of a lost worker.
+threads. Results are added in the order of the passes, so that the sum is identical, bit for bit, to the sum on a single
+machine. At most two tasks per initial worker are in flight. Dask reassigns the tasks of a lost worker.
 """
 
 from __future__ import annotations
@@ -124,7 +124,7 @@ def _trace_on_worker(job: Job, index: int) -> NDArray[np.float32]:
 
 @lru_cache(maxsize=1)
 def scene_of(job: Job) -> mi.Scene:
-    """Load the scene of a job, once; raise RuntimeError if it or its files differ from those of the job."""
+    """Load the scene of a job, once; raise RuntimeError if the scene or one of its files differs from the job."""
     try:
         scene = job.load()
         content = scene_digest(job.scene, job.where["parameters"], job.where["materials"])

@@ -69,7 +69,7 @@ def check_requirements() -> None:
 
 
 def guides(scene: mi.Scene, band: Rows | None = None) -> Guides:
-    """Render the guides of a scene, or of a band of its rows; errors as of `check_requirements`."""
+    """Render the guides of a scene, or of a band of its rows; for errors see `check_requirements`."""
     check_requirements()
     sensor = scene.sensors()[0]
     columns, rows = (int(size) for size in sensor.film().crop_size())

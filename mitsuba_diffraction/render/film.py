@@ -39,7 +39,7 @@ SampleRange = Callable[["mi.UInt32", "mi.Bool"], tuple["mi.UInt32", "mi.UInt32"]
 
 
 def pass_seed(seed: int, index: int) -> int:
-    """Return a 32-bit seed for one pass, independent of those of other passes and other `seed`s."""
+    """Return a 32-bit seed for one pass, independent of the seeds of other passes and other `seed`s."""
     return int(np.random.SeedSequence((seed, index)).generate_state(1)[0])
 
 
@@ -71,7 +71,7 @@ def trace_pass(
         Σ_s f(c − p_s) ¼ Σ_j L_s(λ_sj) t_i(λ_sj)    in channel i,    and finally    Σ_s f(c − p_s);
 
     their ratio is radiance per nm. The sums of passes are additive. Samplers that correlate samples are rotated
-    (`rotated`), so that the expectation of any pass is that of independent samples.
+    (`rotated`), so that any pass has the expectation of independent samples.
 
     The result is determined, bit for bit, by the seed, the scene, the versions of Mitsuba and Dr.Jit and the type of
     processor. Integrators that need Mitsuba's film (`needs_mitsubas_film`) are not reproducible in the last bits.
@@ -80,9 +80,9 @@ def trace_pass(
         scene: from `load_spectral_scene`.
         spp: samples per pixel; the scene's sampler may draw more (`sampler_of`).
         seed: 32 bits.
-        integrator: replaces that of the scene.
-        rows: those to be traced; default: all. Samples outside them, but under the filter of one of their pixels,
-            count. Bands have independent random numbers, except for the paths from the light, which are common to all.
+        integrator: replaces the integrator of the scene.
+        rows: traced rows; default: all. Samples outside these rows count if they are under the filter of one of their
+            pixels. Bands have independent random numbers, except for the paths from the light, which are common to all.
         light: of all bands; required with `rows`.
         alpha: also return Σ_s f(c − p_s) v_s, with v_s one if the integrator finds the sample valid, else zero; not
             with Mitsuba's film.
@@ -177,7 +177,7 @@ def rotated(sampler: mi.Sampler, seed: int, pixel: mi.UInt32) -> mi.Sampler:
     pixel, sixteenths of the unit square receive up to 24 % (`multijitter`) or 17 % (`stratified`) too much or too
     little, and 34 % for any number of samples with `ldsampler`; pictures then have wrong colours. Here a random shift
     per pixel and dimension is added to each number, modulo one (Cranley and Patterson, 1976): each sample is uniform,
-    and those of a pixel remain stratified.
+    and the samples of a pixel remain stratified.
 
     Args:
         pixel: index of the pixel of each sample; its width is the number of samples for which the sampler is seeded.
@@ -242,7 +242,7 @@ class LightOfBands:
                 self._columns = traced.shape[1]
                 for (first, end), file in zip(self.bands, self._files, strict=True):
                     row = traced[:, 1]
-                    # Points on the lower edge of the film count as of its last row.
+                    # Points on the lower edge of the film count as part of its last row.
                     below = np.inf if end == self.bands[-1][1] else end + margin
                     file.write(traced[(row >= first - margin) & (row < below)].tobytes())
             self._traced = spp, seed
@@ -337,9 +337,9 @@ def _sums_of_light(
     size: tuple[int, int],
     margins: tuple[int, int, int],
 ) -> mi.Float | None:
-    """Return the sums of the contributions of paths from the light, see `collect`; None if there are none.
+    """Return the sums of the contributions of paths from the light (see `collect`); None if there are none.
 
-    They are sorted by pixel, and those of a pixel by the order of tracing.
+    Contributions are sorted by pixel, and within a pixel by the order of tracing.
     """
     if not len(splats):
         return None
@@ -390,7 +390,7 @@ def collect(
 
     `channel` and `value` are lists; the value at a fractional channel is divided linearly between the two nearest
     channels. The result has `channels` sums and then the sum of filter weights of each pixel. There are also samples in
-    the `margins`: pixels at each side, rows above and rows below. Those of the channels are added to `earlier` sums.
+    the `margins`: pixels at each side, rows above and rows below. The sums of the channels are added to `earlier` sums.
     """
     rows, columns = size
     sides, above, below = margins

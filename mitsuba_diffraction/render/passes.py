@@ -162,7 +162,7 @@ def checkpoint_path(picture: Path) -> Path:
 
 
 def checkpoint_of_band(checkpoint: str | os.PathLike[str], index: int) -> str:
-    """Return the path of the checkpoint of a band; that of the first has no number."""
+    """Return the path of the checkpoint of a band; the path of the first has no number."""
     return f"{os.fspath(checkpoint)}.{index}" if index else os.fspath(checkpoint)
 
 
@@ -204,7 +204,7 @@ def load_checkpoint(path: str | os.PathLike[str], digest: str) -> Accumulation |
 
 
 class BandedSums:
-    """The sums of a picture in bands of rows: those of one band in memory, all others in checkpoints.
+    """The sums of a picture in bands of rows: one band is in memory, all others are in checkpoints.
 
     Attributes:
         bands: rows of each band.
@@ -223,7 +223,7 @@ class BandedSums:
         alpha: bool = False,
         spectral_range: SpectralRange = VISIBLE,
     ) -> None:
-        """Read existing checkpoints; errors as of `load_checkpoint`. Without `checkpoint`, they are temporary files."""
+        """Read existing checkpoints (errors: see `load_checkpoint`); without `checkpoint` they are temporary files."""
         self.bands, self._columns, self._digest, self.spectral_range = bands, columns, digest, spectral_range
         if checkpoint is None and len(bands) > 1:
             checkpoint = Path(tempfile.mkdtemp(), "sums")
@@ -283,7 +283,7 @@ class BandedSums:
 
 
 class BandedImage(SpectralImage):
-    """A picture that is read from its sums: of one band at a time, as long as `radiance` is not read as a whole."""
+    """A picture kept as sums; one band is in memory at a time. Reading `radiance` loads all of it."""
 
     _sums: BandedSums
 
@@ -368,7 +368,7 @@ class Job:
         return hash(self.digest())
 
     def load(self) -> mi.Scene:
-        """Load the scene; errors as of `load_spectral_scene`."""
+        """Load the scene; for errors see `load_spectral_scene`."""
         return load_spectral_scene(self.scene, **self.where)
 
 
@@ -460,7 +460,7 @@ def render(
     Args:
         scene_path: an XML scene; its film may be of any kind (see `load_spectral_scene`).
         spp: samples per pixel, four wavelengths each; the scene's sampler may add up to three.
-        width, height, parameters, materials, motion: as of `load_spectral_scene`.
+        width, height, parameters, materials, motion: see `load_spectral_scene`.
         seed: random seed, not negative.
         until_error: stop when the relative error of the picture (`error_of_picture`) is at most this; spp is then the
             maximum.
@@ -482,9 +482,9 @@ def render(
 
     Raises:
         FileNotFoundError: if there is no such scene.
-        ValueError: as `load_spectral_scene`, or if a number is out of range, the picture needs more memory or its bands
-            more of the disk than is available, or the checkpoint is of another rendering, or one that another process
-            writes.
+        ValueError: (a) as for `load_spectral_scene`; (b) if a number is out of range; (c) if there is too little memory
+            for the picture or too little disk for its bands; (d) if the checkpoint belongs to another rendering or is
+            in use.
         RuntimeError: if rendering failed, with the cause on one line.
         OSError: if a checkpoint cannot be written; the previous one is kept.
         Finished: without rendering, if the picture with the digest `finished` satisfies this request.

@@ -71,7 +71,7 @@ def channel_weights(spectral_range: SpectralRange = VISIBLE) -> NDArray[np.float
     the samples would have wavelengths to which the eye is insensitive; these weights follow the density of Mitsuba's
     RGB film, sech²(0.0072 (λ − 538 nm)) (Radziszewski, Boryczko and Alda 2009), which reduces colour noise by a
     quarter, as much as 1.8 times the samples would. The lower bound of one quarter limits the noise of a channel to
-    twice that of the best one.
+    twice the noise of the best one.
     """
     return np.maximum(np.cosh(0.0072 * (channel_wavelengths(spectral_range) - 538)) ** -2, 0.25)
 
@@ -94,9 +94,9 @@ def load_spectral_scene(
     """Load an XML scene in the current variant and replace its film by a spectral one.
 
     The film becomes a `specfilm` of float32 whose channels are hat functions at `channel_wavelengths()` with areas of
-    `channel_weights()`: divided by these, a channel is spectral radiance per nm, averaged over the hat. They cover
-    visible light, or the bands of a `specfilm` that lie outside it. Size, crop and reconstruction filter are those of
-    the scene. File names in the scene are relative to its folder.
+    `channel_weights()`: divided by these, a channel is spectral radiance per nm, averaged over the hat. The channels
+    cover visible light, or the bands of a `specfilm` that lie outside it. Size, crop and reconstruction filter are
+    taken from the scene. File names in the scene are relative to its folder.
 
     Args:
         width: of the full film in pixels; the crop window is scaled with it. If only one of width and height is given,
@@ -201,7 +201,7 @@ def _visible_points(scene: mi.Scene) -> tuple[mi.SurfaceInteraction3f, mi.Direct
 
 
 def max_plausible_luminance(scene: mi.Scene) -> float:
-    """Return a luminance that no pixel should exceed by noise: 10⁴ times that of the brightest light found.
+    """Return a luminance that no pixel should exceed by noise: 10⁴ times the luminance of the brightest light found.
 
     Point and directional lights have an irradiance E instead of a radiance L, and narrow lobes reflect up to some
     10⁴ E: they count as L = 10⁴ E. The result is infinite if no light is found.
@@ -277,7 +277,7 @@ def _emission(emitter: mi.Emitter, grid: NDArray[np.float64]) -> NDArray[np.floa
 
 
 def named_sample_count(path: str | os.PathLike[str], parameters: Mapping[str, str] | None = None) -> int | None:
-    """Return the sample_count of the sampler of a scene's first sensor, None if unspecified; errors as of `parsed`."""
+    """Return the sample_count of the sampler of a scene's first sensor, or None; for errors see `parsed`."""
     with parsed(path, parameters) as (_, state):
         counts = [sampler.get("sample_count") for sampler in _of_first_sensor(state, mi.ObjectType.Sampler)]
         count = next((count for count in counts if count is not None), None)
@@ -287,7 +287,7 @@ def named_sample_count(path: str | os.PathLike[str], parameters: Mapping[str, st
 
 
 def has_alpha(path: str | os.PathLike[str], parameters: Mapping[str, str] | None = None) -> bool:
-    """Return whether the film of a scene's first sensor has a `pixel_format` with alpha; errors as of `parsed`."""
+    """Return whether the film of a scene's first sensor has a `pixel_format` with alpha; for errors see `parsed`."""
     with parsed(path, parameters) as (_, state):
         formats = [str(film.get("pixel_format", "rgb")) for film in _of_first_sensor(state, mi.ObjectType.Film)]
     return any(name.lower() in _FORMATS_WITH_ALPHA for name in formats)
@@ -305,7 +305,7 @@ def scene_digest(
 ) -> str:
     """Return the SHA-256 of a valid scene: its XML after substitution of parameters, and the files it references.
 
-    Files enter by content, not by path; a recipe includes the scan it references. Errors as of `parsed`.
+    Files enter by content, not by path; a recipe includes the scan it references. For errors see `parsed`.
     """
     content = hashlib.sha256(Path(path).read_bytes())
     with parsed(path, parameters, materials) as (_, state):
@@ -455,8 +455,8 @@ def files_of_scene(
 ) -> list[Path]:
     """Return the files that a scene names: itself, included files, files of its plugins, scans of its recipes.
 
-    Tables of spectra (`<spectrum filename="…"/>`) are not included, as the parser keeps only their values. Errors as of
-    `parsed`, or if a recipe is wrong.
+    Tables of spectra (`<spectrum filename="…"/>`) are not included, as the parser keeps only their values. For errors
+    see `parsed`; a wrong recipe is one, too.
     """
     with parsed(path, parameters, materials) as (_, state):
         texts = [
@@ -549,7 +549,7 @@ def _round_sample_counts(state: mi.parser.ParserState) -> None:
 
 
 def _children(state: mi.parser.ParserState, props: mi.Properties, kind: mi.ObjectType | None = None) -> dict[str, int]:
-    """Return name → index in the parser's list of the children of a node; only those of `kind`, if it is given."""
+    """Return name → index in the parser's list of the children of a node; if `kind` is given, only of this kind."""
     # Of a copy: reading marks a property as used, and Mitsuba reports unused ones as errors.
     copy, kind_of_reference = mi.Properties(props), mi.Properties.Type.ResolvedReference
     references = [(name, copy[name].index()) for name in copy.keys() if copy.type(name) == kind_of_reference]  # noqa: SIM118

@@ -203,8 +203,8 @@ class _Surface:
     ) -> list[Scattered]:
         """Solve for light of all orders from above and below, for each (ν², γ'²).
 
-        The harmonics are raised, from those of `gratings[finer]`, while R + T differs from one by more than the
-        tolerance, or R exceeds one if the material absorbs.
+        The number of harmonics begins at its value for `gratings[finer]`. It is raised while R + T differs from one by
+        more than the tolerance; if the material absorbs, while R exceeds one.
 
         Args:
             alpha: α of order 0, in units of 2π/T.
@@ -302,7 +302,7 @@ def _errors(spectrum: RigorousSpectrum, checks: list[_Check]) -> dict[str, Any]:
 
 
 class _Build:
-    """Solver on a coarser grid than that of `Axes`, for all orders of light from above and below together.
+    """Solver on a coarser grid than `Axes`, for all orders of light from above and below together.
 
     The fields above depend on a and γ alone, those below on a and γ'. Each is the solution of one eigenproblem, which
     takes most of the time. With transmission a lattice of γ and one of γ' serve all of their pairs.

@@ -94,7 +94,8 @@ class Efficiencies:
         transmitted: the transmitted fraction of incident s and p light, (2,); NaN if the material absorbs.
         harmonics: N; fields are sums of 2N + 1 waves.
         error: the largest, over s and p light, of three numbers: the change Σ|Δη_m| / Σ η_m of the reflected orders at
-            the last increase of N, that of the transmitted orders, and `imbalance`. If N was given, `imbalance` alone.
+            the last increase of N, the same change of the transmitted orders, and `imbalance`. If N was given,
+            `imbalance` alone.
     """
 
     orders: NDArray[np.int64]
@@ -283,7 +284,7 @@ def scattered(curve: Curve, omega: Real, k_0: float, index: complex, harmonics: 
 def sheet_orders(curve: Curve, omega: Real, k_0: float, index: float, harmonics: int) -> tuple[NDArray[np.int64], Real]:
     """Return the orders transmitted by a sheet, ascending, and η_m of s and of p light, (n, 2).
 
-    Arguments are those of `solve`, for light from above.
+    For arguments see `solve`; light is incident from above.
     """
     solved = scattered(curve, omega, k_0, index, harmonics)
     matrices = through_sheet(solved, index)[ABOVE, BELOW][:, list(solved.orders[ABOVE]).index(0), 0].real
@@ -329,10 +330,10 @@ _BOUNCE_LOSS = 1e-9
 def through_sheet(solved: Scattered, index: float) -> dict[tuple[int, int], Complex]:
     """Compute the Mueller matrices of a sheet, with all internal reflections summed incoherently.
 
-    The plane is far from the grating, so that the Stokes vectors of each order add up. With the Mueller matrices of all
-    orders together, G those of the grating and F, T those of reflection and refraction at the plane (diagonal in the
-    orders), light that travels downwards inside is D = (1 − G F)⁻¹ G times the incident light, which enters through the
-    grating or, by T, through the plane, and
+    The plane is far from the grating, so that the Stokes vectors of each order add up. Let G be the Mueller matrices of
+    the grating for all orders together. F and T are the matrices of reflection and refraction at the plane, diagonal in
+    the orders. Light enters through the grating or, by T, through the plane. The light that travels downwards inside is
+    D = (1 − G F)⁻¹ G times the incident light, and
 
         above → above: G + G F D,    below → below: F + T D T,    above → below: T D,    below → above: G (1 + F D) T.
 

@@ -312,7 +312,7 @@ class RigorousSpectrum:
         """Indices of the media of side 0 and side 1, relative to side 0."""
         return 1.0, self.int_ior.real if self.transmission == "interface" else 1.0
 
-    # The same attributes as those of `GratingSpectrum`.
+    # Attributes that `GratingSpectrum` has, too.
     extent = "tile"
     representation = "rigorous"
     largest_angle = 90.0

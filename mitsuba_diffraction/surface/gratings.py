@@ -87,9 +87,9 @@ def blazed(period: float = 2.5, depth: float = 0.246, *, samples: int = 512) -> 
 def ruled(lines_per_mm: float = 600.0, *, blaze_wavelength: float = 500.0, samples: int = 512) -> HeightField:
     """Return a blazed grating, (1, samples), with given lines per millimetre and blaze wavelength λ_B in nm.
 
-    The blaze wavelength is that of the first order in Littrow mounting, where light returns along the normal of the
-    facets, at the blaze angle θ_B (Palmer 2020, Diffraction Grating Handbook, chapters 2 and 9). With the
-    period d and the depth D of a groove,
+    At the blaze wavelength the first order in Littrow mounting returns along the normal of the facets, at the blaze
+    angle θ_B (Palmer 2020, Diffraction Grating Handbook, chapters 2 and 9). With the period d and the depth D of a
+    groove,
 
         λ_B = 2 d sin θ_B,    D = d tan θ_B.
 
@@ -134,7 +134,7 @@ def transmission_300(*, facet_angle: float = 17.5, samples: int = 512) -> Height
 
 
 def transmission_600(*, facet_angle: float = 28.7, samples: int = 512) -> HeightField:
-    """Return a ruled transmission grating of 600 lines/mm, as `transmission_300`; the angle is that of GT25-06V."""
+    """Return a ruled transmission grating of 600 lines/mm, as `transmission_300`, with the angle of GT25-06V."""
     return right_angled(1000 / 600, facet_angle, samples=samples)
 
 
@@ -165,8 +165,8 @@ def lamellar(period: float, depth: float, *, duty: float = 0.5, samples: int = 5
 def crossed(period: float, depth: float, *, period_y: float | None = None, samples: int = 128) -> HeightField:
     """Return the sum of sinusoids along x and y, (samples, samples): the orders are products |F_{m_x}|² |F_{m_y}|².
 
-    `depth` is that of *each* sinusoid; their sum spans twice that. `period_y`, along y, is by default that along x;
-    both have as many `samples`.
+    *Each* sinusoid has the depth `depth`; their sum spans twice this depth. `period_y`, along y, is by default equal to
+    `period`; both axes have as many `samples`.
     """
     check_profile(period, depth, samples)
     check_pixels(samples, samples)
@@ -331,8 +331,8 @@ def compact_disc(
     0.126 µm at 780 nm maximises contrast, λ/8n the tracking signal). The lengths of pits and lands are random with the
     maximum-entropy distribution under that constraint.
 
-    The pits are those of the metal, as an instrument measures them without the polycarbonate. For a complete disc, use
-    `coat_ior` = 1.55 of the plugin.
+    The pits are given as in the metal, where an instrument measures them without the polycarbonate. For a complete
+    disc, use `coat_ior` = 1.55 of the plugin.
 
     Args:
         period: track pitch, µm.

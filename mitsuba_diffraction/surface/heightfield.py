@@ -174,8 +174,8 @@ def harmonic_fill(heights: ArrayLike, pixel_size: tuple[float, float] = (1.0, 1.
 
         Σ_n w_n (h_n − h_p) = 0,    w = 1/d_x² along a row, 1/d_y² along a column
 
-    over those of its four neighbours n that lie inside the array. At the edge of the array this implies the natural
-    boundary condition ∂h/∂n = 0. Filled heights lie within the range of the known ones.
+    over the pixel's neighbours n, of the four, that lie inside the array. At the edge of the array this implies the
+    natural boundary condition ∂h/∂n = 0. Filled heights lie within the range of the known ones.
 
     Pérez, Gangnet and Blake 2003, "Poisson image editing", ACM Transactions on Graphics 22(3), 313–318: equations
     1 and 2, and 7 without a guidance field, with neighbourhoods truncated at the edge of the array.

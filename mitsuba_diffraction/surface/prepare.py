@@ -105,7 +105,7 @@ def align_lines(height_field: HeightField) -> HeightField:
         difference = heights[line] - previous
         shared = difference[~np.isnan(difference)]
         offsets[k] = offsets[k - 1] + (np.median(shared) if len(shared) else 0.0)
-        # Missing pixels are replaced by those of the line before.
+        # Missing pixels are replaced by pixels of the line before.
         previous = np.where(np.isnan(heights[line]), previous + offsets[k] - offsets[k - 1], heights[line])
     # The median slope of an oblique asymmetric profile is not zero, which accumulates to a tilt over the lines.
     offsets -= np.polyval(np.polyfit(lines, offsets, 1 if len(lines) > 1 else 0), lines)
@@ -275,11 +275,12 @@ def largest_rectangle(width: float, height: float, cos: float, sin: float) -> tu
 def crop_periods(height_field: HeightField, axes: str = "xy") -> HeightField:
     """Crop along "x", "y" or "xy" to a whole number of periods, so that the patch tiles without a seam.
 
-    The periods are those of `find_periods`, at most two. Along each axis the strongest wave with a period along it sets
-    the length: of the multiples of its period that keep at least half of the patch, the one closest to a multiple of
-    the other period, or else the largest. As the length is not a whole number of pixels, a remainder of up to half a
-    pixel would be a seam, which diffracts into spurious orders. The heights are therefore resampled by cubic splines to
-    the nearest number of pixels.
+    `find_periods` finds at most two periods. Along each axis the strongest wave with a period along this axis is taken.
+    Candidate lengths are multiples of its period that keep at least half of the patch. The largest candidate that is
+    nearly a multiple of the second period, too, is chosen; if there is none, the one closest to such a multiple.
+    Without a second period, it is the largest. As the length is not a whole number of pixels, a remainder of up to half
+    a pixel would be a seam, which diffracts into spurious orders. The heights are therefore resampled by cubic splines
+    to the nearest number of pixels.
 
     Raises:
         ValueError: if pixels are missing, no period is found, or less than one fits into the patch.

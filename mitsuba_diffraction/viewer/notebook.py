@@ -36,7 +36,7 @@ def view(surface: str | os.PathLike[str] | Recipe | GratingSpectrum, height: int
     Args:
         surface: a recipe or its file (.toml), a spectrum or its file (.exr), or the name of a profile.
         height: of the view, pixels.
-        parameters: `material` or `int_ior`, `orientation`, `height_scale`; and those of the profile.
+        parameters: `material` or `int_ior`, `orientation`, `height_scale`; and the parameters of the profile.
 
     Raises:
         RequestError: if a parameter is wrong, or the page does not show such a surface.

@@ -56,7 +56,7 @@ def page(surface: Surface, *others: Surface, picture: NDArray[np.float16] | None
         picture: linear sRGB for comparison with the first, (height, width, 3), the lowest row first.
 
     Raises:
-        RequestError: if that of one surface would be larger than `MAX_BYTES`, or two have one name.
+        RequestError: if the page of one surface would be larger than `MAX_BYTES`, or two surfaces have one name.
     """
     text = (_ASSETS / "page.html").read_text(encoding="utf-8")
     shaders = {path.stem: path.read_text(encoding="utf-8") for path in sorted(_ASSETS.glob("*.glsl"))}

@@ -60,9 +60,9 @@ class Result:
         megabytes: of the table.
         build_seconds: of `precompute`.
         evaluations: of eval_pdf per second of processor time, four wavelengths each.
-        evaluate_ratio: speed of eval_pdf to that of roughconductor (Al) in the same run.
-        sample_ratio: speed of sample to that of roughconductor (Al) in the same run.
-        beside_measured: speeds of eval_pdf and sample to those of `measured_bsdf` in the same run.
+        evaluate_ratio: speed of eval_pdf relative to roughconductor (Al) in the same run.
+        sample_ratio: speed of sample relative to roughconductor (Al) in the same run.
+        beside_measured: speeds of eval_pdf and sample relative to `measured_bsdf` in the same run.
         accuracy: against the float64 reference.
     """
 

@@ -34,7 +34,7 @@ class Case:
     def spectrum(
         self, tolerance: float = 1e-3, representation: str = "auto", terms: int | None = None
     ) -> GratingSpectrum:
-        """Compute the spectrum of the surface; arguments and errors as of `precompute`."""
+        """Compute the spectrum of the surface; for arguments and errors see `precompute`."""
         with warnings.catch_warnings():
             # The warnings of coarse pixels and of few terms do not matter here.
             warnings.simplefilter("ignore", UserWarning)
@@ -71,7 +71,7 @@ def bundled_cases() -> list[Case]:
 
 _MEASURED_FOLDER = source() / "precompute" / "measured"
 MEASURED = {"elaphe": 0.4347, "xenopeltis": 0.8187}
-"""µm from black to white, of the scans of 65 µm in precompute/measured, as of the published maps."""
+"""µm from black to white, of the scans of 65 µm in precompute/measured, as in the published maps."""
 _CROP = slice(333, 999)  # of 1332 rows and columns: the central 32.5 µm
 
 TIMED_TILES = ("synthetic, 0.375 µm", "measured Elaphe", "measured Xenopeltis")
@@ -93,8 +93,8 @@ def scan(name: str, height_range: float, settings: Settings) -> Recipe:
 def tiles() -> list[Case]:
     """Return synthetic skins of three depths, and the centres of both measured skins, as tiles in sunlight.
 
-    The heights of the measured skins are those of the pictures, without any preparation; at the edges of a tile they
-    jump.
+    The heights of the measured skins are read from the pictures, without any preparation. They jump at the edges of a
+    tile.
     """
     cases = [
         Case(f"synthetic, {depth:g} µm", gratings.elaphe(8.0, depth=depth, seed=1), "tile", SUN_COHERENCE_LENGTH)

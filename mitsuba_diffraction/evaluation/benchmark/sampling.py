@@ -116,7 +116,7 @@ def _fraction(bsdf: mi.BSDF, angle: float, count: int) -> tuple[float, float]:
 
 
 def _against_cosine(bsdf: mi.BSDF, angle: float, count: int, repetitions: int) -> float:
-    """Return variance times seconds of cosine sampling over those of the BSDF's own sampling, under a uniform sky."""
+    """Return variance times seconds of cosine sampling, relative to the BSDF's own sampling, under a uniform sky."""
     random = np.random.default_rng(1)
     si = testing.interaction(np.broadcast_to(testing.direction(angle, 30.0), (count, 3)), _wavelengths(0.3))
     sample1, sample2 = mi.Float(random.random(count)), mi.Point2f(random.random((2, count)))

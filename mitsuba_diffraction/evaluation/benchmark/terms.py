@@ -181,7 +181,7 @@ class Method:
         megabytes: of the table or the textures.
         error: ∫|ΔS| dq in float32, if S is what it computes; None for the reference.
         delta_e: (mean, maximum) CIEDE2000 of twelve patches of colour.
-        time_ratio: of one evaluation, to that of slices in the same run.
+        time_ratio: of one evaluation, relative to slices in the same run.
     """
 
     surface: str
@@ -236,7 +236,7 @@ def methods(
     }
     work |= {name: functools.partial(rays.evaluate, bsdf) for name, bsdf in bsdfs.items()}
     work |= {name: shading(points, shader) for name, shader in shaders.items()}
-    # Processor time does not depend on other processes; that of a GPU is not counted.
+    # Processor time does not depend on other processes, but excludes the time of a GPU.
     clock = time.process_time if mi.variant().startswith("llvm") else time.perf_counter
     with _one_core():
         taken = seconds(work, repetitions, clock)
@@ -298,7 +298,7 @@ def _spectra(case: Case, series: Sequence[SeriesErrors]) -> dict[tuple[str, int 
         assert isinstance(whole.table, AmplitudeTable)
         for count in sorted({*SHOWN_TERMS, needed}):
             first = dataclasses.replace(whole.table, terms=whole.table.terms[:count])
-            # E is that of slices, as it takes time.
+            # E is taken from the slices, as its computation takes time.
             result[kind, count] = dataclasses.replace(whole, table=first, energy=slices.energy_table())
     return result
 

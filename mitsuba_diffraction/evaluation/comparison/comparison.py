@@ -120,17 +120,18 @@ def compare(
         terms: number of Taylor terms; default: as published, or, corrected, as many as needed.
         window: "texel" or "4sigma" (flss, nmm); default: as published "texel", corrected "4sigma".
         interpolation: "sinc" or "linear" (pq, nmm_pq).
-        brightness: of the shader, 1000 in the published program; default: of each picture the one with which its
-            diffraction has the mean luminance of this model's in the same light.
+        brightness: of the shader, 1000 in the published program. Default: chosen for each picture so that the mean
+            luminance of its diffraction equals this model's under the same light.
         pigment: show what lies below the gratings; the published pictures show diffraction alone.
-        width: in pixels; default: that of the film.
+        width: in pixels; default: the width of the film.
         height: likewise.
         spp: samples per pixel of the path tracer.
         shading_points: per pixel of the shader, each with its whole spectrum.
         seed: of the random numbers, not negative.
         parameters: values for the scene's `$name` parameters.
         shares: measure the fraction of the difference that is due to each quirk.
-        shares_side: the longer side, in pixels, of the pictures for `shares`; limited to that of the picture.
+        shares_side: the longer side, in pixels, of the pictures for `shares`; limited to the longer side of the
+            picture.
         progress: progress(label) is a context whose value is called with (done, total).
 
     Raises:

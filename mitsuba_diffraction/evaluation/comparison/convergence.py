@@ -1,8 +1,8 @@
 """Error of a picture against rendering time: the path tracer and the real-time shaders.
 
 All pictures of a scene are compared with one reference: the path tracer's, with many samples and a third of the
-lowest tolerance. The error of the path tracer tends to zero with noise and tolerance; that of the shaders to their
-bias.
+lowest tolerance. The error of the path tracer tends to zero with noise and tolerance; the error of a shader tends to
+its bias.
 """
 
 from __future__ import annotations
@@ -130,7 +130,7 @@ def convergence(
         reference_samples: per pixel of the reference.
         shaders: names.
         shading_points: per pixel of the shaders, ascending.
-        width: in pixels; default: that of the film.
+        width: in pixels; default: the width of the film.
         parameters: further values for the scene's `$name` parameters.
         progress: progress(label) is a context whose value is called with (done, total).
 

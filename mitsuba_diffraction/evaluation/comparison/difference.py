@@ -96,9 +96,9 @@ def time_of_error(error: float, seconds: ArrayLike, errors: ArrayLike) -> float:
 
 
 def noise(halves: NDArray[np.float64] | None, where: NDArray[np.bool_], white: float) -> float | None:
-    """Estimate the mean CIEDE2000 between a picture and its noise-free limit, as half of that between its two halves.
+    """Estimate the mean CIEDE2000 between a picture and its noise-free limit: half of it between its two halves.
 
-    The variance of the mean of two halves is a quarter of that of their difference.
+    The variance of the mean of two halves is a quarter of the variance of their difference.
 
     Args:
         halves: of `Picture`.

@@ -168,13 +168,13 @@ class Pictures:
         Args:
             scene_path: an XML scene whose integrator is a path tracer.
             shader: one of `VARIANTS`.
-            width: in pixels; default: that of the film.
+            width: in pixels; default: the width of the film.
             height: likewise.
             seed: of the random numbers, not negative.
             parameters: values for the scene's `$name` parameters.
             settings: further parameters of the `diffraction_shader`: terms, window, interpolation.
-            brightness: of the shader; default: the one with which the diffraction of each of its pictures has the mean
-                luminance of that of `same_light`.
+            brightness: of the shader. Default: chosen for each of its pictures so that their diffraction has the mean
+                luminance of the diffraction in `same_light`.
             pigment: show what lies below the gratings, too.
 
         Raises:
@@ -263,7 +263,8 @@ class Pictures:
         """Render the scene's BSDFs under the lights that the shader supports; see `same_light` of this module.
 
         Gratings are evaluated at the points of `shaded`, each at all wavelengths of the shader, and the light of other
-        BSDFs is the same picture: noise cancels in the difference from the corrected shader. Arguments as of `shaded`.
+        BSDFs is the same picture: noise cancels in the difference from the corrected shader. For arguments see
+        `shaded`.
         """
         self._choose(())
         model, rest = same_light(self.scene), without_gratings(self._shader)
@@ -329,7 +330,7 @@ class Pictures:
         """Add the colours of gratings at points of the pixels to the light of all other BSDFs.
 
         Colours and their `brightness` are scaled to a mean `luminance` over the gratings, if one is given. Returns the
-        picture and that mean; other arguments as of `shaded`.
+        picture and that mean; for other arguments see `shaded`.
         """
         known = (self._shader.quirks.constant_blend, self._shader.shadows, others)
         if known not in self._others:

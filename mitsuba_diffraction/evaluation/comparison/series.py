@@ -56,7 +56,7 @@ COLUMNS = {
 
 @dataclass(frozen=True)
 class Row:
-    """A picture, compared with that of slices.
+    """A picture, compared with the picture by slices.
 
     Attributes:
         name: "slices", or "taylor, 20 terms".
@@ -120,7 +120,7 @@ def study(
         terms: numbers of terms, ascending.
         origins: levels of h = 0, among "mean" and "lowest".
         samples: per pixel.
-        width: in pixels; default: that of the film.
+        width: in pixels; default: the width of the film.
         parameters: further values for the scene's `$name` parameters; `representation` is "taylor" by default.
         progress: progress(label) is a context whose value is called with (done, total).
 
@@ -184,7 +184,7 @@ def _spectrum(scene: mi.Scene, representation: str) -> GratingSpectrum:
 
 def _traced(scene: mi.Scene, samples: int) -> tuple[Picture, float]:
     """Return a picture, and the seconds of compiling its kernels."""
-    # Processor time does not depend on other processes; that of a GPU is not counted.
+    # Processor time does not depend on other processes, but excludes the time of a GPU.
     clock = time.process_time if mi.variant().startswith("llvm") else time.perf_counter
     columns, rows = scene.sensors()[0].film().crop_size()
     sums, passes = Accumulation.empty(rows, columns), split(scene, samples, 2)

@@ -45,7 +45,7 @@ class FLSS(TextureShader):
         """Set up the shader with the arguments of `TextureShader` and `window`.
 
         Args:
-            window: "texel" or "4sigma", instead of that of the quirk `one_texel`.
+            window: "texel" or "4sigma", instead of the window of the quirk `one_texel`.
         """
         if window not in (None, *WINDOWS):
             raise RequestError(f"window: got {window!r}, wanted one of {', '.join(WINDOWS)}")

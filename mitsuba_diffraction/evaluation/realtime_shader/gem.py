@@ -62,7 +62,7 @@ class GEM(Shader):
         active: mi.Bool = True,
         height_scale: mi.Float = 1.0,
     ) -> mi.Color3f:
-        """Return linear RGB, before gamma; arguments as of `TextureShader.rgb`, heights have no effect."""
+        """Return linear RGB, before gamma; for arguments see `TextureShader.rgb`. Heights have no effect."""
         active = mi.Bool(active) & (wi.z > 0) & (wo.z > 0)
         path = dr.abs(wi.x + wo.x) * self.spacing
         highlight = dr.exp(-dr.square(self.roughness * path / dr.maximum(wi.z + wo.z, 1e-6)))
@@ -74,7 +74,7 @@ class GEM(Shader):
 
 
 def strongest_period(height_field: HeightField) -> float:
-    """Return the period along x (µm) of the strongest Fourier component of the heights; that of the tile if flat."""
+    """Return the period along x (µm) of the strongest Fourier component of the heights; the tile's period if flat."""
     power = np.abs(scipy.fft.rfft(height_field.centred - height_field.centred.mean(), axis=1)) ** 2
     orders = power.sum(axis=0)[1:]
     if orders.size == 0 or orders.max() == 0:

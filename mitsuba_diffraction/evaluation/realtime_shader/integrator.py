@@ -84,8 +84,8 @@ def define() -> type:
             self.emission = Emission()
             mi.SamplingIntegrator.__init__(self, props)
             self._shaders: list[tuple[Layers, Shader]] = []
-            # Of the scene, by `prepare`: the lights that are supported; the BSDFs of the gratings; those of the shapes
-            # that are gratings or in which gratings are nested; and what takes the place of the layers of each grating.
+            # Of the scene, by `prepare`: the lights that are supported; the BSDFs of the gratings; the BSDFs of shapes
+            # that are gratings or in which gratings are nested; and what replaces the layers of each grating.
             self.lights: list[Light] = []
             self.gratings: list[mi.BSDF] = []
             self.outer: list[mi.BSDF] = []

@@ -17,15 +17,16 @@ class NMMPQ(PQ):
     """Only the wavelengths that satisfy the grating equation, of P × Q tiles.
 
     As in `NMM`, n runs along the axis j with the larger |u_j T_j|: λ_n = |u_j| T_j/n. There the PQ factor of this axis
-    has its maximum, and |P|² is that of `PQ`. Order zero of this axis, |u_j| T_j < λ/2, contains all wavelengths.
+    has its maximum, and |P|² is the same as in `PQ`. Order zero of this axis, |u_j| T_j < λ/2, contains all
+    wavelengths.
 
     When corrected, each wavelength represents the area of its line. With x = |u_j| T_j/λ, dλ = λ²/(|u_j| T_j) dx; the
     coordinate along the other axis is y = ρx, |ρ| ≤ 1; and about an order (n, m) the factors tend to sinc²:
 
         ∫ |P|² dλ = λ_n²/(|u_j| T_j) Σ_m |F_nm|² I_m,     I_m = ∫ sinc²(N t) sinc²(M (ρt + δ)) dt,     δ = ρn − m,
 
-    for N tiles along j and M across. The Jacobian λ_n²/(|u_j| T_j) = |dλ/dn| is that of NMM. By Parseval's theorem I_m
-    is the transform of a product of two triangles, of half widths N and M|ρ|. With r = M|ρ|/N ≤ 1
+    for N tiles along j and M across. The Jacobian λ_n²/(|u_j| T_j) = |dλ/dn| is the same as in NMM. By Parseval's
+    theorem I_m is the transform of a product of two triangles, of half widths N and M|ρ|. With r = M|ρ|/N ≤ 1
 
         I_m = h(r, 2πMδ)/N,     h(r, c) = ∫ (1 − |g|)(1 − r|g|) cos(cg) dg, |g| ≤ 1,
                                         = 2 [(1 + r)(1 − cos c) + 2r (cos c − sin(c)/c)]/c²,

@@ -9,7 +9,7 @@ from ...errors import RequestError
 
 @dataclass(frozen=True)
 class Quirks:
-    """True means "as published", false "corrected"; equations are those of the thesis of 2014.
+    """True means "as published", false "corrected"; equations have the numbers of the thesis of 2014.
 
     "As published" is what made the published pictures. Where the text of the thesis differs from them, its version is
     not emulated; docs/thesis.md lists these differences.
@@ -17,13 +17,13 @@ class Quirks:
     Attributes:
         schlick: Schlick's approximation (eq. B.1), at 60° a fifth too low for an index of 1.5; corrected: the Fresnel
             reflectance of a dielectric; a conductor keeps Schlick's.
-        fixed_index: F is that of an index of 1.5 for any material; corrected: R at normal incidence of the material.
+        fixed_index: F has an index of 1.5 for any material; corrected: R at normal incidence of the material.
         complex_window_sum: |Σ φ F|² without the spatial average ⟨·⟩; corrected: Σ φ² |F|².
         one_texel: the neighbourhood is one texel on each side (section 4.4.1); corrected: as many as
             span 4σ_f (section 4.3.2).
         floor_anchor: the neighbourhood is centred at ⌊·⌋ of the texel position (algorithm 4.3, lines 12 and 13);
             corrected: at the nearest texel.
-        fixed_coherence: the window is that of a coherence length of 65 µm; corrected: that of the recipe.
+        fixed_coherence: the window has a coherence length of 65 µm; corrected: the coherence length of the recipe.
         periodic_scan: a scan, a piece of an irregular surface, is one period of a tiling with seams; corrected: it is
             tapered by the mean of the windows with which this model averages over the scan (`taper.py`).
         fixed_terms: the published number of Taylor terms for any surface; corrected: as many as an error of 1e-4

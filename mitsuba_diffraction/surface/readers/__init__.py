@@ -99,10 +99,10 @@ def read_height_field(
     | .spm, .000, .nid, .ibw, .sdf, .x3p, … | instrument formats, with the extra `instruments` | |
 
     Args:
-        path: the file; its extension determines the format, and its content if that is unknown.
-        pixel_size: µm, one number or (x, y). Overrides that of the file; required if the file has none.
+        path: the file; its extension determines the format, or its content if the extension is unknown.
+        pixel_size: µm, one number or (x, y). Overrides the pixel size of the file; required if the file has none.
         height_range: height of the full range of the integer type (black to white), µm; heights start at zero.
-            For integers only. Overrides that of the file.
+            For integers only. Overrides the range of the file.
         fill_missing: interpolate NaN or infinite pixels (`heightfield.harmonic_fill`), do not refuse them; `source`
             and `filled` of the height field report their number.
         channel: of a file with several (.gwy and instrument formats), by name or number. None selects the one that
@@ -214,7 +214,7 @@ def _in_unit(read: Scan, unit: str | tuple[str, str], extension: str) -> Scan:
 
 
 def _extension_of_content(path: Path) -> str:
-    """Return the extension for which a file is read whose own one is unknown; that one if the content is unknown."""
+    """Guess the format from the first bytes; if that fails, return the file's own extension."""
     with open(path, "rb") as stream:
         start = stream.read(_HEADER_BYTES)
     if text.is_gwyddion_export(start):

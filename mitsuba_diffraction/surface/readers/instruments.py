@@ -109,7 +109,7 @@ def read(path: Path, unit: str | tuple[str, str] | None, channel: str | int | No
 
 @contextmanager
 def _quiet() -> Iterator[None]:
-    """Silence loggers: those of the library print what a damaged file holds, in full."""
+    """Silence loggers: the library logs the whole content of a damaged file."""
     before = logging.root.manager.disable
     logging.disable()
     try:

@@ -1,4 +1,4 @@
-"""Valid files that SurfaceTopography refuses or misreads, rewritten in the form that it reads; and what it misreads.
+"""Work-arounds for SurfaceTopography: valid files that it refuses or misreads are rewritten first.
 
 - .tmd: the comment has any length; the library reads 24 bytes.
 - .x3p (ISO 25178-72): a folder that was zipped, heights as text in main.xml, empty offsets, dates that are none, and
@@ -8,7 +8,7 @@
   may have no unit.
 - .spm, .000: lines and length of a part of a scan (`nanoscope`).
 - .jpk-qi-data, .jpk-force-map: archives of force curves, with an image of the heights as in a .jpk.
-- .jpk: the size is that of the grid, of which an image may have a part of the lines.
+- .jpk: the file states the size of the grid; an image may have only a part of its lines.
 - .nms: lengths are in nm instead of mm, heights are linear between two integers of the header, and pixels without
   intensity were not measured.
 """
@@ -169,7 +169,7 @@ _REWRITE: dict[str, Callable[[bytes], bytes]] = {"tmd": _tmd, "sur": _sur, "x3p"
 
 
 def ibw_has_unit(contents: str | io.BytesIO) -> bool:
-    """Return whether an Igor wave has a unit of the heights; the library takes that of the surface if it has none."""
+    """Return whether an Igor wave has a unit of the heights. Without one, the library takes the unit of the surface."""
     return not isinstance(contents, io.BytesIO) or contents.getbuffer()[_IBW_UNIT] != 0
 
 

@@ -2,8 +2,8 @@
 
 A header has a section for the scan as it was set, and one for each image. `Aspect Ratio` is width to length. Where it
 is not 1:1, and there is no `Slow Axis Size`, the two equal numbers of `Scan Size` are the sides of the square of which
-a part was scanned; of a scan that was stopped they are those of the whole scan. The library takes them for those of the
-image, and where the lines of an image do not fit its data, the lines that were set.
+a part was scanned. If a scan was stopped, they are the sides of the whole scan. The library takes them for the sides of
+the image. Where the lines of an image do not fit its data, it takes the lines that were set.
 """
 
 from __future__ import annotations
@@ -122,7 +122,7 @@ def _aspect(fields: dict[str, str]) -> float | None:
 
 
 def _size(value: str) -> tuple[float, float, str]:
-    """Return width, length and unit of a `Scan Size`; one number is that of a square."""
+    """Return width, length and unit of a `Scan Size`; one number is the side of a square."""
     words = value.split()
     try:
         return float(words[0]), float(words[1]), " ".join(words[2:])

@@ -107,7 +107,7 @@ class Channel:
 
 
 def choose(channels: Sequence[Channel], wanted: str | int | None) -> Channel:
-    """Return the named channel, or that of the heights.
+    """Return the named channel, or the channel of the heights.
 
     Args:
         wanted: number, name or unique part of a name (case-insensitive). None selects the only channel of lengths, or
