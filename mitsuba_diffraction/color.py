@@ -220,10 +220,10 @@ _WHITENING = 0.15  # a pixel ten times too bright is desaturated by 58 %
 def roll_off(rgb: NDArray[np.floating]) -> NDArray[np.float64]:
     """Compress highlights into [0, 1] without a shift of hue.
 
-    The brightest channel p of a pixel is unchanged up to 0.8 and becomes 1 − d²/(p + d − 0.8) above, d = 0.2, which is
-    smooth and tends to 1; the other channels are scaled equally. Very bright pixels are then desaturated. This is the
-    Khronos PBR Neutral tone mapper (Khronos Group, 2024) without its toe, which applies to dielectric surfaces. Both
-    are linear sRGB, (..., 3), not negative.
+    The brightest channel p of a pixel is unchanged up to 0.8. Above, it becomes 1 − d²/(p + d − 0.8) with d = 0.2,
+    which is smooth and tends to 1. The other channels are scaled by the same factor. Very bright pixels are then
+    desaturated. This is the Khronos PBR Neutral tone mapper (Khronos Group, 2024) without its toe, which applies to
+    dielectric surfaces. Both are linear sRGB, (..., 3), not negative.
     """
     peak = rgb.max(axis=-1, keepdims=True)
     d = 1 - _SHOULDER_START

@@ -41,7 +41,7 @@ class OrderEfficiencies:
     Attributes:
         values: (order, angle, wavelength, polarisation), s- before p-polarised incident light; 0 where an order does
             not propagate.
-        orders: m, (n,), ascending; of a tile that varies along x and y (m_x, m_y), (n, 2); names of peaks
+        orders: m, (n,), ascending; for a tile that varies along x and y (m_x, m_y), (n, 2); or names of peaks
             (`PeakEfficiencies`).
         angles: of incidence, degrees, (a,).
         wavelengths: nm, in vacuum, (w,).
@@ -204,7 +204,7 @@ def efficiencies(
     (`rigorous.efficiencies`).
 
     Args:
-        height_field: one period of a periodic surface; for rigorous theory a profile, h(x).
+        height_field: one period of a periodic surface; rigorous theory needs a profile, h(x).
         angles: of incidence, degrees, one or (a,), above −90 and below 90.
         wavelengths: nm, in vacuum, one or (w,).
         theory: "scalar" or "rigorous".

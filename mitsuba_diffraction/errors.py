@@ -21,7 +21,7 @@ class RequestError(ValueError):
 
 
 class Bug(Exception):
-    """A bug of this package inside a plugin, of which Mitsuba keeps only the text: its class, then its message."""
+    """A bug of this package inside a plugin. Mitsuba keeps only its text: its class, then its message."""
 
 
 def is_bug(kind: type[BaseException]) -> bool:

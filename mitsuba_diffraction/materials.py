@@ -244,7 +244,7 @@ def conductor(material: str) -> RefractiveIndex:
     """Return the index of a conductor from the tables of Mitsuba and of this package.
 
     Raises:
-        RequestError: if there is none of this name.
+        RequestError: if no material has this name.
     """
     folder = Path(str(metadata.distribution("mitsuba").locate_file("mitsuba/data/ior")))
     tables = [path for at in (_OWN, folder) for path in at.glob("*.eta.spd")]
@@ -263,8 +263,8 @@ def read_index(path: str | os.PathLike[str]) -> RefractiveIndex:
     """Read n + ik from a file.
 
     `.spd`: columns of the wavelength in nm and n, and k if there is a third one; beside `NAME.eta.spd`, `NAME.k.spd`
-    has k, as in Mitsuba. `.csv` and `.yml`: as refractiveindex.info writes them, with wavelengths in µm; of the
-    formulas, 1 and 2 (Sellmeier), 3 (polynomial) and 5 (Cauchy).
+    has k, as in Mitsuba. `.csv` and `.yml`: as refractiveindex.info writes them, with wavelengths in µm. Supported
+    formulas: 1 and 2 (Sellmeier), 3 (polynomial) and 5 (Cauchy).
 
     Raises:
         FileNotFoundError: if there is no such file.

@@ -2,9 +2,9 @@
 
 An irregular surface spreads its orders over the frequency plane. Its peaks are found in S(q; κ) + S(−q; κ) at normal
 incidence, the mean over the requested wavelengths, smoothed by one lobe width σ_q against speckle. Each frequency
-belongs to the maximum to which it ascends; of two maxima, the lower one is a peak of its own if S falls to less than
-`_MAX_SADDLE` of it between them (its saddle). A peak extends down to its saddle, or to 1/e² of its maximum: for a
-single lobe to 2√2 σ_q, which is 98 % of its power.
+belongs to the maximum to which it ascends. Of two maxima, the lower one is a peak of its own if S falls between them
+(at its saddle) to less than `_MAX_SADDLE` of the lower maximum. A peak extends down to its saddle, or to 1/e² of its
+maximum: for a single lobe to 2√2 σ_q, which is 98 % of its power.
 """
 
 from __future__ import annotations

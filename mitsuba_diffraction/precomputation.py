@@ -49,7 +49,7 @@ def precompute(
 
     Args:
         height_field: the surface; or several periodic patches (extent "tile") of one size, random samples of an
-            irregular surface, whose spectra are averaged.
+            irregular surface. The spectra of patches are averaged.
         progress: called with (steps done, steps in all). An interrupted build of rigorous theory resumes from
             intermediate results in the cache folder.
 

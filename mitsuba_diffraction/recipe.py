@@ -204,7 +204,7 @@ class Recipe:
         return tuple(patches)
 
     def height_field(self) -> HeightField:
-        """Return the surface, read or computed at the first call; of several patches, the first."""
+        """Return the surface, read or computed at the first call; the first one if there are several patches."""
         with stage("heights"):
             return self._height_field
 

@@ -144,7 +144,7 @@ def scalar_orders(
 
     Args:
         powers: of the profile or tile.
-        period: µm, of a profile; of a tile along x and y.
+        period: µm; for a tile, along x and y.
         wavelength: µm.
         angle: of incidence, degrees, from −x.
         index: n + ik of the material; ∞ of a perfect mirror.
@@ -231,7 +231,7 @@ def error_map(material: str = "dielectric") -> tuple[Array, Array, Array, Array]
 
     Args:
         material: "dielectric", n = 1.5, or "Al", aluminium at 550 nm; "transmitted" and "transmitted from below": the
-            transmission of the dielectric, directions being those in air.
+            transmission of the dielectric, with directions in air.
 
     Returns:
         period/λ (n,), depth/λ (k,), directions (a, 2) in degrees, and the error, (n, k, a). Directions are the angle of

@@ -61,7 +61,7 @@ class Settings:
         int_ior: in rigorous theory, index of a dielectric, or n + ik; a name or a file is kept as material.
         material: or a conductor by Mitsuba's name, a medium with dispersion, or a file (`materials.index_of`).
         ext_ior: in rigorous theory, index of the medium above relative to air, for a grating under a coat; wavelengths
-            are those in this medium.
+            are measured in this medium.
         polarised: in rigorous theory, whether to store Mueller matrices for polarised variants; the table is then
             seventeen times as large.
         transmission: in rigorous theory, "interface" or "sheet" to include the light that a dielectric transmits.

@@ -38,7 +38,7 @@ MAX_STATES = 9
 
 
 def crossed(field: tuple[Array, Array], y: Array, u: Array, v: Array) -> tuple[Array, Array]:
-    """Return (B, C) at the outer face of a film from that at its inner face.
+    """Return (B, C) at the outer face of a film from (B, C) at its inner face.
 
     Args:
         field: B and C.
@@ -86,7 +86,7 @@ def powers(
 
 
 def _root(square: NDArray[np.complex128]) -> NDArray[np.complex128]:
-    """Return √z², of which real and imaginary part are not negative, and not both zero at the critical angle."""
+    """Return √z², with real and imaginary part not negative, and not both zero at the critical angle."""
     return np.sqrt(square + 1e-14j)
 
 

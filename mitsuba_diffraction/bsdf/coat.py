@@ -5,9 +5,9 @@ Inside, sin θ' = sin θ/n and the wavelength is λ/n, hence κ' = 2πn (cos θ'
 
     f = T_i T_o R' K' G' E' S(q; κ')/λ²,    T = 1 − F(θ)
 
-where F is the power reflectance of the front face and R' the reflectance of the material relative to n; primed
-quantities are those inside. The front face also reflects F specularly. Light that the grating diffracts beyond the
-critical angle, or that the front face reflects back to the grating, is lost.
+where F is the power reflectance of the front face and R' the reflectance of the material relative to n. Primed
+quantities are measured inside the coat. The front face also reflects F specularly. Light that the grating diffracts
+beyond the critical angle, or that the front face reflects back to the grating, is lost.
 """
 
 from __future__ import annotations

@@ -1,8 +1,8 @@
 """A sampler of q for smooth spectra and for orders that overlap, from a table of bins.
 
 With s = k_i,∥, light diffracted at the frequency q propagates if |λq + s| ≤ n_o: q lies in the disc of the radius
-n_o/λ around c = −s/λ. A q that is drawn outside of it is replaced by its inversion in the circle of the horizon,
-c + (n_o/λ)² (q − c)/|q − c|²: for any medium and any incident direction every sample propagates, and no sum over the
+n_o/λ around c = −s/λ. A q that is drawn outside of it is replaced by its inversion in the circle of the horizon, c +
+(n_o/λ)² (q − c)/|q − c|². Every sample then propagates, for any medium and any incident direction, and no sum over the
 disc is needed.
 """
 
@@ -71,7 +71,7 @@ class BinSampler:
 
     with A_jnm the mean power, in a bin of κ (`KappaBins`), of the bin in row n and column m, |q_x − mΔ_x| ≤ Δ_x/2 and
     |q_y − nΔ_y| ≤ Δ_y/2. M_j is their sum. Of lines and ridges, whose q is spread along one axis, much light may be
-    evanescent: only the rows that meet the disc are drawn and summed; they lie across this axis.
+    evanescent: only the rows that meet the disc are drawn and summed. Rows lie across this axis.
 
     A bin is drawn by two binary searches, for its row and for its block of columns; the density at a given q reads two
     words, of lines and ridges two packets more.
@@ -129,7 +129,8 @@ class BinSampler:
     def sample(self, incidence: Incidence, u: mi.Float, v: mi.Point2f, active: mi.Bool) -> mi.Point2f:
         """Draw q in cycles/µm, for one wavelength.
 
-        `u` chooses the κ bin and the row, `v.x` the block, the column and the position in it, `v.y` that in the row.
+        `u` chooses the κ bin and the row, `v.x` the block, the column and the position in the column, `v.y` the
+        position in the row.
         """
         centre = self._axes(-incidence.tangent * incidence.frequency)
         kappa_bin, u = choose(self.kappa_bins.weights(incidence), u)

@@ -23,7 +23,7 @@ class Material:
     Attributes:
         transparent: whether transmitted light is not absorbed.
         wavelengths: range in which the reflectance is known, nm.
-        eta: relative index of refraction in the middle of visible light, a mi.Float; None if there is none.
+        eta: relative index of refraction in the middle of visible light, a mi.Float; None without an index.
         outside: absolute index of the medium above, to which indices are relative.
         varies: whether the material varies over the surface.
         dispersion: the relative index of a transparent material over the wavelength; None if it is constant.

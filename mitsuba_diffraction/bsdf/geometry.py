@@ -2,9 +2,9 @@
 
 All lengths are in units that make the lateral scale of the relief one (`Scales` in `parameters.py`).
 
-A coat and the flat face of a sheet are plane layers: they keep the tangential component of k = n ω and change the
-normal one, so that k next to the relief follows from k outside. κ has a sign: as S(q; −κ) = S(−q; κ), the tables for
-κ ≥ 0 are read at −q where κ < 0.
+A coat and the flat face of a sheet are plane layers. They keep the tangential component of k = n ω and change the
+normal one, so that k next to the relief follows from k outside. κ has a sign: as S(q; −κ) = S(−q; κ), the tables for κ
+≥ 0 are read at −q where κ < 0.
 
 Separate orders: K and G are computed per order (`Geometry.order_squares_and_gain`). Continua: K and G are computed
 once, from the two directions (`Geometry.continuum_factor`).
@@ -72,7 +72,7 @@ class Interface:
 
     Attributes:
         coat_index: n of the medium next to the relief above, relative to the outside; one without a coat.
-        eta: index below relative to that above; one where no light is transmitted.
+        eta: index below relative to the index above; one where no light is transmitted.
         transmits: whether there is a medium below.
         is_sheet: whether the lower medium is a film with a flat lower face, with the upper medium below it.
         rigorous: whether tables are of rigorous theory: these do not depend on the sign of κ, include the flat face of
@@ -215,7 +215,7 @@ class Geometry:
 
     @property
     def factor(self) -> mi.Float:
-        """n_o² |cos θ_o| outside: a density in q is λ²/(n_o² |cos θ_o|) times that in solid angle."""
+        """n_o² |cos θ_o| outside. A density in q is λ²/(n_o² |cos θ_o|) times the density in solid angle."""
         return self.outgoing.index * dr.sqrt(self.outgoing.square)
 
     def kappa(self, frequency: mi.Float) -> mi.Float:
@@ -380,7 +380,7 @@ class Incidence:
     k_oz: tuple[mi.Float, mi.Float, mi.Float]
 
     def at(self, wavelength: mi.Float, lobe_scale: mi.Float | float = 1.0) -> Incidence:
-        """Return the same at another wavelength (µm) and with scaled lobes, from that at 1 µm."""
+        """Return the incidence at another wavelength (µm) and with scaled lobes, from the incidence at 1 µm."""
         frequency = dr.rcp(wavelength)
         return dataclasses.replace(
             self,
@@ -441,7 +441,7 @@ class Incidence:
     def fraction_below(self, kappa: mi.Float) -> mi.Float:
         """Return the assumed fraction of light with less than κ (rad/µm).
 
-        Reflected light is distributed as by a diffuse surface; of transmitted light, half is near the undiffracted
+        Reflected light is distributed as by a diffuse surface. Half of the transmitted light is near the undiffracted
         order, half is uniform in k_oz.
         """
         v_z, (horizon, normal, per) = kappa * self.per_kappa, self.k_oz

@@ -113,7 +113,7 @@ class Grating:
         return float(shortest), float(longest)
 
     def parameters_changed(self, keys: list[str]) -> None:
-        """Check the parameters `keys`, or all if there are none, and recompute what depends on them."""
+        """Check the parameters `keys` and recompute what depends on them; without keys, all parameters."""
         if not keys or "orientation" in keys:
             check_texture("orientation", self.orientation)
         self.theory.parameters_changed(keys)

@@ -84,7 +84,7 @@ class Layers:
             callback.put("base", self.base.bsdf, mi.ParamFlags.Differentiable)
 
     def parameters_changed(self, keys: list[str]) -> None:
-        """Check the parameters `keys`, or all if there are none, and recompute what depends on them."""
+        """Check the parameters `keys` and recompute what depends on them; without keys, all parameters."""
         if self.base is not None and (not keys or "base" in keys):
             self.base.check()
         self.grating.parameters_changed(keys)

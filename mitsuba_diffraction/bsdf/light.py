@@ -37,7 +37,7 @@ def cover_light(scene: mi.Scene, sensor: mi.Sensor | int | None = None) -> None:
         sensor: the sensor of a picture, or its number; default: all sensors of the scene.
 
     Raises:
-        RequestError: if the tables of one cannot; it names the range, and how to widen it.
+        RequestError: if the tables of a grating cannot cover the light. It names the range, and how to widen it.
     """
     if not is_supported(mi.variant()):
         return

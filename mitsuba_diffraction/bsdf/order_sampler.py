@@ -150,7 +150,7 @@ class OrderSampler:
         return self.layout.directions(nodes)
 
     def _inside(self, omega: NDArray[np.float64], above: bool, inside: float) -> NDArray[np.float64]:
-        """Return the directions next to the relief, in the index `inside`, from those outside."""
+        """Return the directions next to the relief, in the index `inside`, from the directions outside."""
         outside = self._indices(above, inside)[1]
         tangent = omega[:, :2] * (outside / inside)
         return np.column_stack([tangent, np.sqrt(np.maximum(1 - (tangent**2).sum(-1), 1e-12))])
@@ -197,7 +197,7 @@ class OrderSampler:
         )
         first = np.clip(np.ceil(first.min(1)), -self.max_order, self.max_order).astype(np.int64)
         last = np.clip(np.floor(last.max(1)), -self.max_order, self.max_order).astype(np.int64)
-        # From inside of a medium beyond the critical angle of all orders, none.
+        # From inside of a medium there are no orders beyond the critical angle of all of them.
         return first + self.max_order, np.maximum(last - first + 1, 0)
 
     def _bin(self, incidence: Incidence, active: mi.Bool) -> tuple[mi.UInt32, mi.Int32, mi.Int32, mi.Int32, mi.Int32]:
@@ -273,7 +273,7 @@ def _packed_cumulative(
 
 
 def cumulative_units(p: NDArray[np.float64], possible: NDArray[np.bool_]) -> NDArray[np.float64]:
-    """Return cumulative sums of P_m in units of 2⁻²⁴, of which float32 has exact differences, beginning with zero.
+    """Return cumulative sums of P_m, beginning with zero, in units of 2⁻²⁴: float32 then has exact differences.
 
     P_m is proportional to `p` among the `possible` orders, but for `UNIFORM_FRACTION`, which is divided equally among
     them, and zero elsewhere: (..., orders) → (..., orders + 1). Where no order is possible, all sums are zero.

@@ -250,7 +250,7 @@ def _inside(props: mi.Properties, media: Media, scale: float, recipe: Recipe) ->
 
 
 def _next_to_relief(theory: str, media: Media, scale: float, wavelengths: tuple[float, float]) -> tuple[float, float]:
-    """Return the wavelengths (shortest, longest) for which to build a spectrum, from those in air, nm."""
+    """Return the wavelengths (shortest, longest) for which to build a spectrum, from the wavelengths in air, nm."""
     # Rigorous tables of a bare surface are for the wavelengths above it.
     if theory == "rigorous" and media.coat is None:
         return wavelengths
@@ -375,7 +375,7 @@ def check_parameters(props: mi.Properties, spectrum: RigorousSpectrum, coat: Coa
             f"coat_ior: got {'none' if coat is None else f'{coat.index:g}'}, but the rigorous spectrum is of a grating "
             f"below a medium of index {spectrum.ext_ior:g}: build it with ext_ior={medium:.4g}"
         )
-    # With a coat, `ext_ior` is that above the coat.
+    # With a coat, `ext_ior` is the index above the coat.
     if any(name in props for name in ("material", "int_ior", *(["ext_ior"] if coat is None else []))):
         wanted = settings_from(props, coat)
         if "material" in wanted:

@@ -1,6 +1,6 @@
 """Mueller matrices of a grating: of a plane at the half vector in scalar theory, exact in rigorous theory.
 
-docs/validation.md compares the former with rigorous results.
+docs/validation.md compares the matrices of scalar theory with rigorous results.
 """
 
 from __future__ import annotations
@@ -68,7 +68,7 @@ def of_facets(
             value of transmitted light.
         planes: returns the matrices between s axes at each wavelength, up to a factor, from the cosine of the direction
             of incidence and h, negative from below, and from whether light is reflected.
-        eta: index below relative to that above.
+        eta: index below relative to the index above.
     """
 
     def split(source: mi.Vector3f, exit_: mi.Vector3f, source_axis: mi.Vector3f, exit_axis: mi.Vector3f) -> mi.Spectrum:

@@ -36,7 +36,7 @@ class SharedTables:
     """The tables of one spectrum for all BSDFs that have it, in one variant of Mitsuba.
 
     Attributes:
-        table: the powers and their sampler; of resolved orders without the sampler, which depends on the scene.
+        table: the powers and their sampler. For resolved orders there is no sampler here, as it depends on the scene.
         stack: the material and its films, if light is transmitted.
         max_scale: the maximum lateral scale for which orders are resolved; None if they overlap without scaling.
     """

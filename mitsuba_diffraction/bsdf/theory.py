@@ -131,7 +131,7 @@ class Theory(Protocol):
         return
 
     def parameters_changed(self, keys: list[str]) -> None:
-        """Recompute all that depends on the parameters `keys`, or on any if there are none; nothing by default."""
+        """Recompute what depends on the parameters `keys`; without keys, on any of them. Nothing by default."""
         return
 
     def coordinates(self, geometry: Geometry) -> tuple[Coordinates, Coordinates] | None:
@@ -379,7 +379,7 @@ class RigorousTheory(Theory):
 
         def entries(channel: int, source: mi.Vector3f, exit_: mi.Vector3f) -> list[list[mi.Float]]:
             frequency = relative / si.wavelengths[channel]
-            # Under a coat, directions and wavelength are those inside of it.
+            # Under a coat, directions and wavelength are measured inside of it.
             k_i, k_o = (self.interface.wave_vector(rotated(omega, sin, cos)) for omega in (source, exit_))
             return self.scattering.mueller(k_i, k_o, frequency, active)
 

@@ -79,7 +79,7 @@ class _Plane:
 
 
 def _root(square: mi.Complex2f, is_real: bool) -> mi.Complex2f:
-    """Return √z², of which real and imaginary part are not negative, and not both zero at the critical angle."""
+    """Return √z², with real and imaginary part not negative, and not both zero at the critical angle."""
     if is_real:
         # A literal zero, with which Dr.Jit simplifies all that follows.
         return mi.Complex2f(dr.sqrt(larger(square.real, 1e-14)), 0)
@@ -171,7 +171,7 @@ def listed(name: str, text: str) -> list[str]:
     """Return the entries of a list such as "2.35, 1.38", or with repetitions, "8 x (2.35, 1.38), 2.35".
 
     Raises:
-        RequestError: if it is none, or has too many entries.
+        RequestError: if it is no such list, or has too many entries.
     """
     found: list[str] = []
     rest = text.strip()
@@ -384,7 +384,7 @@ class StackedMaterial(_Filmed):
         films, from_below = integer_part(self.count), cos < 0
 
         def body(step: mi.UInt32, *state: mi.Complex2f) -> tuple[Any, ...]:
-            # From the innermost film outwards; from the outermost inwards for light from below.
+            # From the innermost film outwards; for light from below, from the outermost inwards.
             film = dr.select(from_below, step, films - 1 - step) if self.transparent else films - 1 - step
             thickness, following = scale * dr.gather(mi.Float, self.thickness, film, active), []
             for channel, (plane, node, fraction) in enumerate(zip(planes, starts, fractions, strict=True)):

@@ -73,7 +73,7 @@ class VaryingNumber:
 
 
 def numbers_from(name: str, file: str, white: float = 1.0, others: str = "") -> mi.Texture:
-    """Return a texture of the numbers in a picture, without gamma; of integers, the maximum is `white`.
+    """Return a texture of the numbers in a picture, without gamma. The maximum of an integer type becomes `white`.
 
     `others` are the texts that the parameter may have instead, for the message.
 

@@ -54,6 +54,6 @@ def _files(root: Path) -> list[Path]:
     """Return the files of the examples, relative to `root`."""
     found = [path.relative_to(root) for name in ("scenes", "precompute") for path in sorted((root / name).rglob("*"))]
     excluded = {path for path in found if _OUTPUT_FOLDERS & set(path.parts) or path.name.startswith(".")}
-    # .exr files beside scenes and recipes are renderings and spectra; those in subfolders are textures.
+    # .exr files beside scenes and recipes are renderings and spectra; .exr files in subfolders are textures.
     excluded |= {path for path in found if path.suffix == ".exr" and len(path.parts) == 2}
     return [path for path in found if path not in excluded and (root / path).is_file()]

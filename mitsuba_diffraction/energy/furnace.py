@@ -155,7 +155,7 @@ class Furnace:
 
     @property
     def branches(self) -> tuple[int, ...]:
-        """0 for reflected light; for an interface also ±1, for transmitted light with that sign of v_z."""
+        """0 for reflected light; for an interface also ±1, for transmitted light whose v_z has this sign."""
         return (0,) if self.index is None else (0, 1, -1)
 
     @property
@@ -306,7 +306,7 @@ class Furnace:
         return min_kappa(self.spectrum, nominal, self.height_scale, self.lobe_scale)
 
     def _power(self, component: Indices, kappa: Real, branch: int) -> Real:
-        """Return the powers of components at κ; for transmitted light below κ₁ as `small_kappa`."""
+        """Return the powers of components at κ. For transmitted light below κ₁ see `small_kappa`."""
         last = self.powers.shape[1] - 1
         flat, start = self.powers.ravel(), component * (last + 1)
 
@@ -335,7 +335,7 @@ def small_kappas(spectrum: PowerSpectrum, index: float, lateral_scale: float = 1
     The first is a quarter of the first interval of the table, where its error is as small as the error of the linear
     extrapolation. The second, to be multiplied by the ratio h/s of the scales of heights and lengths, is 0.8 of the
     minimum κ of undiffracted light at normal incidence; the longest wavelength is λ/s, with the minimum s. Wavelengths
-    of the spectrum are those in the denser medium.
+    of the spectrum are measured in the denser medium.
     """
     max_wavelength = spectrum.wavelengths[1] * 1e-3 * max(index, 1) / lateral_scale
     return spectrum.table.first_interval / 4, 1.6 * np.pi * abs(index - 1) / max_wavelength

@@ -6,9 +6,9 @@ multiplied by
     E = min(e(ω_i, λ), e(ω_o, λ)),    e = 1/max(1, a)
 
 which is reciprocal, and one where a ≤ 1 for both directions. The table holds e at nodes and is linear between them.
-Where e is smaller at the centre of a grid cell than the mean of its corners, these are lowered by the difference: a
-varies fast where an order is just above the horizon, and in deep reliefs. E is a safeguard of the model; docs/plugin.md
-has measured albedos.
+Where e is smaller at the centre of a grid cell than the mean of its corners, the corners are lowered by the difference.
+This is needed because a varies fast where an order is just above the horizon, and in deep reliefs. E is a safeguard of
+the model; docs/plugin.md has measured albedos.
 
 For a line grating of period T, with c = √(1 − ω_y²) and
 
@@ -17,8 +17,9 @@ For a line grating of period T, with c = √(1 − ω_y²) and
 the order m > 0 propagates if m < u, and the order m < 0 if −m < v. e jumps where u or v is a whole number, and is
 continuous between. Each unit square of (u, v) is therefore divided into grid cells separately. They are finest near its
 lower edges, where an order is just above the horizon; at u = 0 and v = 0, ω itself is at the horizon. With f the
-fractional part of u, nodes are equidistant in √f, which is proportional to cos θ_o of that order. a depends on u and v
-alone, except where lobes meet the horizon: in units of c, their width is proportional to 1/c. The table has one slice.
+fractional part of u, nodes are equidistant in √f, which is proportional to cos θ_o of that order. Where no lobe meets
+the horizon, a depends on u and v alone; where one does, its width in units of c is proportional to 1/c. The table has
+one slice.
 
 For surfaces with orders in two dimensions, for samples and for interfaces the hemisphere is mapped to a square, with
 the normal at its centre and the horizon at its edge,
@@ -157,8 +158,8 @@ class Layout:
     def directions(self, coordinates: Real, frequency: float = np.inf) -> tuple[Real, Real]:
         """Return ω (n, 3) and λ in µm (n,) at coordinates (n, 3): slice, row and column in grid cells; or 0, v and u.
 
-        Many directions of a line grating have the same u and v. Of those whose 1/λ is in the range of the table, the
-        one with 1/λ closest to `frequency` is returned.
+        Many directions of a line grating have the same u and v. Among these the direction with 1/λ in the range of the
+        table, and closest to `frequency`, is returned.
         """
         first, last = self.frequencies
         nu, row, column = coordinates.T
@@ -217,8 +218,8 @@ class EnergyTable:
         sides = [Furnace.of(spectrum, max(ratios), stack, side, laterals[0]) for side in above_and_below]
         layout = Layout.of(sides[0], laterals)
         e = _bounds(layout, sides, ratios, layout.points(0.0), laterals).reshape(len(ratios), -1, *layout.shape)
-        # e varies fast where an order is just above the horizon, and in deep reliefs: where it is less at the centre of
-        # a grid cell than between the corners, they are lowered by the difference.
+        # e varies fast where an order is just above the horizon, and in deep reliefs. Where it is less at the centre of
+        # a grid cell than between the corners, the corners are lowered by the difference.
         corners = layout.corners()
         of_centres = _bounds(layout, sides, ratios, layout.points(0.5), laterals).reshape(e[corners[0]].shape)
         excess = np.where(of_centres < 1, np.mean([e[corner] for corner in corners], axis=0) - of_centres, 0)

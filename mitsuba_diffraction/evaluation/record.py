@@ -17,7 +17,7 @@ class Record:
     """A measured number and the expected one.
 
     Attributes:
-        measured, expected: of several pairs, that with the maximum error relative to its bound.
+        measured, expected: of several pairs, the pair with the maximum error relative to its bound.
         bound: on the error; None where none is claimed.
         relative: whether the error is relative to `expected`.
         note: further information for the reader.

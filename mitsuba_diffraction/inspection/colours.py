@@ -195,7 +195,7 @@ def changes(
     measured: bool,
     build: Callable[[HeightField], GratingSpectrum],
 ) -> tuple[Change, ...]:
-    """Compute two changes of each kind, + and −; of the tip only if the surface was measured.
+    """Compute two changes of each kind, + and −; for the tip only if the surface was measured.
 
     If h and −h have the same shape (sinusoid, sawtooth), a blunter and a sharper tip change the colours equally: one
     widens the ridges, the other the grooves.
@@ -272,7 +272,8 @@ def broadened(height_field: HeightField, change: float, *, extent: str = "sample
     """Return the surface with ridges wider by the fraction `change`, and the signed radius (µm) of the tip required.
 
     The width of ridges is measured by the area above mid-height, half way between the mean of the heights above the
-    average and the mean of those below. The tip radius is found for which it grows by `change` (shrinks, if negative).
+    average and the mean of the heights below. The tip radius is found for which it grows by `change` (shrinks, if
+    negative).
 
     Raises:
         ValueError: if no tip has that effect, as for a flat surface.

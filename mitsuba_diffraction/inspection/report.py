@@ -244,7 +244,7 @@ def statistics(height_field: HeightField, *, extent: str = "sample") -> Statisti
 def reference_plane(height_field: HeightField, extent: str) -> tuple[Array, tuple[float, float]]:
     """Return the reference plane of the heights, (N_y, N_x) µm, and its slopes along x and y.
 
-    For a sample, the least-squares plane; for a tile, which is periodic, a level one.
+    For a sample, the least-squares plane; for a tile, which is periodic, a level plane.
     """
     rows, columns = height_field.shape
     if extent == "tile":

@@ -72,7 +72,7 @@ def define() -> type:
             self.path = nested_plugin("path", max_depth=self.max_depth, rr_depth=self.rr_depth)
 
         def parts(self, scene: mi.Scene, sensor: mi.Sensor) -> tuple[mi.SamplingIntegrator, LightPaths | None]:
-            """Return the tracers of paths from the eye and from the light, the latter None if there are none."""
+            """Return the tracers of paths from the eye and from the light; None for the light without such paths."""
             gratings = _lit_gratings(scene, sensor, self.max_depth)
             if gratings is None:
                 return self.path, None
@@ -166,7 +166,7 @@ def _is_black(bsdf: mi.BSDF | None) -> bool:
 
 
 def _add_light_paths(sensor: mi.Sensor, light: LightPaths, seed: mi.UInt32 | int) -> None:
-    """Add paths from the light to the film of a sensor, which contains those from the eye."""
+    """Add paths from the light to the film of a sensor, which contains the paths from the eye."""
     film = sensor.film()
     # The film divides by its sum of weights, to which splats add zero: their values are multiplied by spp instead.
     spp = sensor.sampler().sample_count()

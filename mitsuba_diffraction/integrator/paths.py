@@ -22,7 +22,7 @@ def ratio(a: mi.Float, b: mi.Float) -> mi.Float:
 
 
 def generator(seed: mi.UInt32 | int, key: int, index: mi.UInt32) -> mi.PCG32:
-    """Return random numbers of each index, independent of those that samplers draw from the same seed."""
+    """Return random numbers of each index, independent of the numbers that samplers draw from the same seed."""
     mixed = mi.UInt32(seed) ^ key
     dr.make_opaque(mixed)
     state, sequence = mi.sample_tea_32(index, mixed)
@@ -179,7 +179,7 @@ def define_eye_paths() -> type:
                 next_si = scene.ray_intersect(ray, active)
                 ds = mi.DirectionSample3f(scene, next_si, si)
                 pdf_emitter = scene.pdf_emitter_direction(si, ds, active)
-                # Emitters are left to emitter sampling, of which the weights ignore points on gratings.
+                # Emitters are left to emitter sampling, whose weights ignore points on gratings.
                 on_target, _ = self.gratings.classify(next_si, to_gratings & next_si.is_valid())
                 on_target &= pdf_emitter == 0
                 grating_pdf = dr.select(on_target, self.gratings.pdf_direction(next_si, ray), 0)
@@ -303,7 +303,7 @@ class LightPaths:
     angles to the normal at which ω_j is reflected or refracted into ω'_j.
 
     y₁ and ω₁ are one of four candidates, chosen with a probability proportional to the radiance received, shadows
-    included (resampling, Talbot 2005): even where a grating is mostly in shadow, most paths begin at a lit point.
+    included (resampling, Talbot 2005). Even where a grating is mostly in shadow, most paths then begin at a lit point.
     """
 
     def __init__(self, scene: mi.Scene, sensor: mi.Sensor, gratings: Gratings, max_depth: int, rr_depth: int) -> None:

@@ -199,7 +199,7 @@ class _Search:
     def _minimised(
         self, far_field: FarField, heights: Array, iterations: int, fixed: NDArray[np.bool_] | bool = False
     ) -> Array:
-        """Return the heights of the smallest loss that L-BFGS-B finds from the given ones, some of them `fixed`."""
+        """Return the heights of the smallest loss that L-BFGS-B finds from `heights`, some of them `fixed`."""
         self._found.append((math.inf, heights))
 
         def loss(flat: Array) -> tuple[float, Array]:

@@ -122,7 +122,7 @@ class Plate:
         """Whether the right of the picture, as it is seen, is −x of ω_o.
 
         An eye that looks the way the light goes, onto a wall, has −x of reflected light at its right, and +x of light
-        that a sheet transmits; one that looks towards the plate, at a screen, has the opposite.
+        that a sheet transmits. An eye that looks towards the plate, at a screen, has the opposite.
         """
         return (self.seen_on == "wall") == (self.int_ior is None)
 
@@ -145,7 +145,7 @@ class Plate:
     def kappa(self) -> Array:
         """κ in rad/µm of each wavelength, (w,), halfway between the middle of the picture and its edge.
 
-        2π (1 + cos θ)/λ; of a sheet whose relief the light meets first, 2π (1 − √(n² − sin² θ))/λ, which is negative.
+        2π (1 + cos θ)/λ. For a sheet whose relief the light meets first, 2π (1 − √(n² − sin² θ))/λ, which is negative.
         """
         sine = math.sin(math.radians(self.angle)) / 2
         path = 1 + math.sqrt(1 - sine**2) if self.int_ior is None else 1 - math.sqrt(self.int_ior**2 - sine**2)

@@ -47,7 +47,7 @@ class Guides:
 
 def is_requested(scene: str | os.PathLike[str]) -> bool:
     """Return whether an XML scene contains `<default name="denoise" value="true"/>`, which Mitsuba ignores."""
-    # By regular expressions: Mitsuba reads scenes that XML parsers refuse, such as those with "--" in a comment.
+    # By regular expressions: Mitsuba reads scenes that XML parsers refuse, such as scenes with "--" in a comment.
     text = re.sub(r"<!--.*?-->", "", Path(scene).read_text(encoding="utf-8", errors="replace"), flags=re.DOTALL)
     tags = (dict(re.findall(r"""(\w+)\s*=\s*["'](.*?)["']""", tag)) for tag in re.findall(r"<default\b([^>]*)>", text))
     value = {tag.get("name"): tag.get("value") for tag in tags}.get("denoise", "false")
@@ -123,7 +123,8 @@ def denoised(XYZ: NDArray[np.floating], guide: Guides) -> NDArray[np.float64]:
     import pyoidn
 
     # Denoised in XYZ, where no visible colour has a negative component. In an RGB space that contains all of them, the
-    # luminance of violet light is a small difference of channels, which denoising loses: its pixels become black.
+    # luminance of violet light is a small difference of channels. Denoising loses this difference: violet pixels become
+    # black.
     to_XYZ = colour.RGB_COLOURSPACES["sRGB"].matrix_RGB_to_XYZ
     white = to_XYZ.sum(1)  # divisor of XYZ, so that grey has equal channels
     albedo = np.ascontiguousarray(guide.albedo @ (to_XYZ.T / white), np.float32)

@@ -34,7 +34,7 @@ Rows = tuple[int, int]
 BAND_PIXELS = 3 * 2**18
 _SPOOLED_BYTES = 2**22  # in memory for each band
 
-# Index of a pixel (row by row), mask → index of its first sample and one past its last; they are contiguous.
+# Index of a pixel (row by row), mask → index of its first sample and one past its last. Its samples are contiguous.
 SampleRange = Callable[["mi.UInt32", "mi.Bool"], tuple["mi.UInt32", "mi.UInt32"]]
 
 
@@ -111,9 +111,9 @@ def needs_mitsubas_film(integrator: mi.Integrator) -> bool:
 def check_memory(scene: mi.Scene, spp: int, bands: tuple[Rows, ...] | None = None) -> int:
     """Check that a picture fits into the available memory, where the system reports it (Linux); return what it needs.
 
-    The peak memory is 8 n + 84 bytes per pixel of n channels of a band (the sums and the result of a pass in float32,
-    and its luminance), 40 bytes per sample of a pass of it (position on the film, channels and values of four
-    wavelengths), and 8 bytes per pixel of the film. With Mitsuba's film, 14 n and 24 n were measured.
+    The peak memory has three parts: 8 n + 84 bytes per pixel of a band with n channels (the sums and the result of a
+    pass in float32, and its luminance), 40 bytes per sample of a pass of the band (position on the film, channels and
+    values of four wavelengths), and 8 bytes per pixel of the film. With Mitsuba's film, 14 n and 24 n were measured.
 
     Args:
         scene: from `load_spectral_scene`.
@@ -155,7 +155,7 @@ def sampler_of(sampler: mi.Sampler, spp: int) -> mi.Sampler:
 
 
 def max_samples(sampler: mi.Sampler, limit: int) -> int:
-    """Return the largest number of samples per pixel up to a limit that a sampler draws, zero if there is none."""
+    """Return the largest number of samples per pixel, up to a limit, that a sampler draws; without one, zero."""
     numbers = range(1, limit + 1)
 
     def drawn(spp: int) -> int:

@@ -142,7 +142,7 @@ class Accumulation:
 
 
 def error_of_picture(errors: NDArray[np.float32]) -> float:
-    """Return the 90th percentile of `Accumulation.relative_errors` over all non-black pixels; NaN if there are none.
+    """Return the 90th percentile of `Accumulation.relative_errors` over all non-black pixels; NaN if all are black.
 
     The mean square over all pixels is not used: where a lamp is seen via two gratings it is dominated by fireflies, and
     does not decrease for hours. With few passes the percentile is biased upwards by the variance of s².
@@ -238,7 +238,7 @@ class BandedSums:
             raise RequestError(f"{checkpoint}: a checkpoint of another band is missing; remove them to start over")
 
     def band(self, index: int) -> Accumulation:
-        """Return the sums of a band, after saving those that were in memory."""
+        """Return the sums of a band, after saving the sums that were in memory."""
         if index != self._index:
             self.release()
             (first, end), path = self.bands[index], self._paths[index]

@@ -68,10 +68,10 @@ def channel_weights(spectral_range: SpectralRange = VISIBLE) -> NDArray[np.float
     """Return the area of the response of each channel, (n,); the recorded value divided by it is radiance.
 
     Mitsuba samples wavelengths in proportion to the sum of the responses of the film. With hats of unit area, half of
-    the samples would have wavelengths to which the eye is insensitive; these weights follow the density of Mitsuba's
-    RGB film, sech²(0.0072 (λ − 538 nm)) (Radziszewski, Boryczko and Alda 2009), which reduces colour noise by a
-    quarter, as much as 1.8 times the samples would. The lower bound of one quarter limits the noise of a channel to
-    twice the noise of the best one.
+    the samples would have wavelengths to which the eye is insensitive. These weights follow the density of Mitsuba's
+    RGB film, sech²(0.0072 (λ − 538 nm)) (Radziszewski, Boryczko and Alda 2009). They reduce colour noise by a quarter,
+    as much as 1.8 times the samples would. The lower bound of one quarter limits the noise of a channel to twice the
+    noise of the best one.
     """
     return np.maximum(np.cosh(0.0072 * (channel_wavelengths(spectral_range) - 538)) ** -2, 0.25)
 
@@ -456,7 +456,7 @@ def files_of_scene(
     """Return the files that a scene names: itself, included files, files of its plugins, scans of its recipes.
 
     Tables of spectra (`<spectrum filename="…"/>`) are not included, as the parser keeps only their values. For errors
-    see `parsed`; a wrong recipe is one, too.
+    see `parsed`; a wrong recipe is an error, too.
     """
     with parsed(path, parameters, materials) as (_, state):
         texts = [
@@ -540,7 +540,7 @@ def no_warnings() -> Iterator[None]:
 
 
 def _round_sample_counts(state: mi.parser.ParserState) -> None:
-    """Replace the numbers of samples of a scene by those that its samplers draw, as they would with a warning each."""
+    """Replace the numbers of samples of a scene by what its samplers draw, without their warnings."""
     for node in state.nodes:
         if node.type == mi.ObjectType.Sampler and isinstance(node.props.get("sample_count"), int):
             with no_warnings():

@@ -85,8 +85,8 @@ def build_spectrum(
     Args:
         height_field: the surface; rows that differ are refused.
         settings: of rigorous theory. The tolerance bounds `RigorousSpectrum.error` and a third of `polarisation_error`.
-        progress: called with (per cent done, 100) of the work of one table. It begins anew if a finer table is
-            needed, which is known only when the error of the first is.
+        progress: called with (per cent done, 100) of the work of one table. It starts again if a finer table is needed,
+            which is known only after the error of the first table.
         checkpoints: a folder for intermediate results, from which an interrupted build resumes.
 
     Raises:
@@ -304,8 +304,8 @@ def _errors(spectrum: RigorousSpectrum, checks: list[_Check]) -> dict[str, Any]:
 class _Build:
     """Solver on a coarser grid than `Axes`, for all orders of light from above and below together.
 
-    The fields above depend on a and γ alone, those below on a and γ'. Each is the solution of one eigenproblem, which
-    takes most of the time. With transmission a lattice of γ and one of γ' serve all of their pairs.
+    The fields above depend on a and γ alone, the fields below on a and γ'. Each is the solution of one eigenproblem,
+    which takes most of the time. With transmission a lattice of γ and one of γ' serve all of their pairs.
     """
 
     def __init__(self, surface: _Surface, steps: tuple[int, int, int], polarised: bool) -> None:

@@ -37,8 +37,8 @@ _KERNEL = np.einsum("iab,jcd->bcadij", _PAULI, _PAULI).reshape(16, 16) / 2
 def mueller(amplitudes: Complex, of_conjugate: Complex | None = None) -> Complex:
     """Return M_ij = Tr(σ_i J σ_j J(k_y*)†) / 2 of amplitudes J, (…, 2, 2) → (…, 4, 4).
 
-    Amplitudes refer to the basis (ê, k̂ × ê), as in `coordinate_transformation.Scattered`. Elements are real; where k_y
-    is imaginary, with J(k_y*) as `of_conjugate`, those that are odd in k_y are imaginary.
+    Amplitudes refer to the basis (ê, k̂ × ê), as in `coordinate_transformation.Scattered`. Elements are real. Where k_y
+    is imaginary, with J(k_y*) as `of_conjugate`, elements that are odd in k_y are imaginary.
     """
     conjugate = (amplitudes if of_conjugate is None else of_conjugate).conj()
     pairs = amplitudes[..., None, None] * conjugate[..., None, None, :, :]
@@ -341,8 +341,7 @@ def through_sheet(solved: Scattered, index: float) -> dict[tuple[int, int], Comp
         solved: of the grating, air above and the dielectric below.
         index: of the dielectric.
 
-    Returns:
-        (side of incidence, side of exit) → matrices, (outgoing, incident, 4, 4); orders are those above.
+    Returns: (side of incidence, side of exit) → matrices, (outgoing, incident, 4, 4), with the orders above.
     """
     outside, inside = solved.orders
     grating = [[_as_matrix(matrices_of(solved, i, o)) for o in (ABOVE, BELOW)] for i in (ABOVE, BELOW)]

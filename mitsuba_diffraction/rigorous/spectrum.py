@@ -57,10 +57,10 @@ class Axes:
         k_y = (ω_o,y − ω_i,y) ν / 2,    γ² = ν² − k_y²,    c = (ω_o,x − ω_i,x) ν / 2.
 
     In units of 2π/T, γ is the wave number across the grooves above the surface, and γ', with γ'² = γ² + (n² − 1) ν²,
-    that below. In order m, incident light with k_x = c + m/2 = n + α is diffracted to c − m/2 = n − m + α, with a whole
-    number n and |α| ≤ 1/2. Where α < 0 the reversed light is looked up, whose c has the opposite sign: only a = |α|
-    remains. η has a square-root singularity where an order is at its Rayleigh anomaly, above or below, that is, where
-    γ or γ' is one of
+    the wave number below. In order m, incident light with k_x = c + m/2 = n + α is diffracted to c − m/2 = n − m + α,
+    with a whole number n and |α| ≤ 1/2. Where α < 0 the reversed light is looked up, whose c has the opposite sign:
+    only a = |α| remains. η has a square-root singularity where an order is at its Rayleigh anomaly, above or below,
+    that is, where γ or γ' is one of
 
         h₀ = a,  h₁ = 1 − a,  h₂ = 1 + a,  h₃ = 2 − a,  …,
 
@@ -77,13 +77,13 @@ class Axes:
         λ = λ₀ + (λ₁ − λ₀) Z,    λ₀ = min(λ_min, T/γ),    λ₁ = min(λ_max, T/γ).
 
     A block of the table is a pair of intervals of γ and γ'. It has a row for each pair of an incident and an outgoing
-    order, those above before those below. The nodes of a row are at equal steps of F, X and Z.
+    order, orders above before orders below. The nodes of a row are at equal steps of F, X and Z.
 
     Attributes:
         period: T in µm.
         wavelengths: (shortest, longest) in µm.
         steps: numbers of steps of F, X and Z.
-        index: n of the medium below, relative to that above; 0 if Z is the wavelength.
+        index: n of the medium below, relative to the medium above; 0 if Z is the wavelength.
         transmission: one of `TRANSMISSIONS`; a sheet has air below.
     """
 
@@ -156,7 +156,7 @@ class Axes:
 
     @cached_property
     def starts(self) -> NDArray[np.int64]:
-        """The first row of each block, [interval of γ, interval of γ'], −1 where there is none."""
+        """The first row of each block, [interval of γ, interval of γ'], −1 where there is no block."""
         found = np.full(np.max(list(self.blocks), axis=0) + 1, -1)
         for intervals, row in self.blocks.items():
             found[intervals] = row
@@ -273,7 +273,7 @@ class RigorousSpectrum:
         harmonics: N of the solver.
         source: origin of the heights.
         source_digest: SHA-256 of the height field.
-        ext_ior: index of the medium above relative to air; wavelengths are those in this medium.
+        ext_ior: index of the medium above relative to air; wavelengths are measured in this medium.
         polarisation_error: the mean of Σ_m max_ij |ΔM_ij| / Σ η_m, measured as `error`; NaN without matrices.
     """
 

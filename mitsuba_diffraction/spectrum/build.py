@@ -146,8 +146,8 @@ def _tile_splines(
 def _cost(packets: int, shape: tuple[int, int]) -> float:
     """Return the cost of an evaluation that reads `packets` nodes of (rows, columns), in reads of a small table.
 
-    On a CPU reads take the same time while the nodes of one κ, at 8 bytes, fill less than 1 MB; beyond, the time grows
-    with the square root of the size.
+    On a CPU reads take the same time while the nodes of one κ, at 8 bytes, fill less than 1 MB. For larger tables the
+    time grows with the square root of the size.
     """
     return packets * max(1.0, shape[0] * shape[1] * 8e-6) ** 0.5
 

@@ -134,7 +134,7 @@ class SliceTable:
     def words_per_node(self) -> int:
         """Words of 32 bits that a renderer reads of a node at one κ: 1 if `packed`, 2 if `halved`, else 4."""
         for terms, words, rounded in ((3, 1, packed), (4, 2, halved)):
-            # For one interval after the other, as all at once would take several times the memory of the table.
+            # One interval after the other: all at once would take several times the memory of the table.
             if self.terms == terms and all(np.array_equal(rounded(v), v) for v in self.values[:, None]):
                 return words
         return 4

@@ -387,7 +387,7 @@ def morpho_ridges(
     """Draw parallel ridges along y of unequal heights: the grating of a Morpho scale, **not its blue**.
 
     The blue is due to a stack of lamellae within each ridge, an interference filter that a height field cannot
-    represent; this surface only models the scattering perpendicular to the ridges. Their uneven heights weaken the
+    represent. This surface only models the scattering perpendicular to the ridges. Their uneven heights weaken the
     orders of the grating and scatter the rest (Kinoshita, Yoshioka & Kawagoe 2002, Proc. R. Soc. B 269, 1417–1421: a
     regular stack on irregular ridges, about 0.7 µm apart and 0.3 µm wide). Modelled on that description, neither
     measured nor of the real depth (about 2 µm, outside the range of scalar theory). For a blue butterfly, use a blue
@@ -608,7 +608,7 @@ def xenopeltis(
     """Draw a synthetic replica of the shed skin of *Xenopeltis unicolor*, not a measurement.
 
     Rows of short round fingers, which point along +x and rise towards their tips like roof tiles. Rows run along y, one
-    period apart along **x**, the diffracting direction; they meander by 10 to 20 degrees and occasionally fork or end.
+    period apart along **x**, the diffracting direction. They meander by 10 to 20 degrees and occasionally fork or end.
     Fingers are 0.36 periods apart along y, with small deep pits between them; some are joined. The shape is modelled on
     a 5.9 µm AFM scan of the LANE lab, Geneva.
 
@@ -675,7 +675,7 @@ def _wrapped(distance: float, size: float) -> float:
 
 
 def _faults(canvas: Canvas, rng: np.random.Generator) -> list[_Fault]:
-    """Draw separate faults, about one per 200 µm²; as many add a row as remove one, so that the mean pitch stays."""
+    """Draw separate faults, about one per 200 µm²; equally many add and remove a row, which keeps the mean pitch."""
     row_pitch = canvas.pitch[0]
     faults: list[_Fault] = []
     wanted = 2 * round(canvas.size[0] * canvas.size[1] / 400)

@@ -1,8 +1,8 @@
 """Periods and directions of a height field, from the peaks of its periodogram.
 
 A periodogram is P(q) = |Σ_n w_n h_n e^{−2πi q·x_n}|²/Σ_n w_n² of heights levelled to second order, w being a Hann
-window; white noise has its variance as mean. A regular wave is sharpest in the periodogram of the whole scan. One that
-wanders is spread over many frequencies there, each with a random power, and stands out better from the mean of the
+window; white noise has its variance as mean. A regular wave is sharpest in the periodogram of the whole scan. A wave
+that wanders is spread over many frequencies there, each with a random power. It stands out better from the mean of the
 periodograms of nine overlapping quarters (Welch 1967, "The use of fast Fourier transform for the estimation of power
 spectra", IEEE Transactions on Audio and Electroacoustics 15(2), 70–73). Of the two, the one whose strongest peak
 exceeds the significant power by the larger factor is used first.

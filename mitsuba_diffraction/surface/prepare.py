@@ -120,13 +120,13 @@ def despike(height_field: HeightField, threshold: float = 5.0) -> HeightField:
 
     Of the 5 × 5 neighbourhood of a pixel, the five highest and the five lowest pixels may be outliers, e.g. a streak
     along a line. The pixel is an outlier if it is above, or below, all others by more than `threshold` standard
-    deviations σ of the noise and by more than twice their range; at the bottom of a groove with straight walls, it is
-    below them by at most their range. Outliers are filled like missing pixels. A ridge one pixel wide on flat ground is
-    also removed.
+    deviations σ of the noise and by more than twice their range. At the bottom of a groove with straight walls, a pixel
+    is below the others by at most their range. Outliers are filled like missing pixels. A ridge one pixel wide on flat
+    ground is also removed.
 
     σ is estimated after Immerkær 1996, "Fast noise variance estimation", Computer Vision and Image Understanding 64(2),
-    300–302, from the mixed second differences along x and y, which nearly vanish for a smooth surface, with the median
-    of their moduli in place of the mean for robustness.
+    300–302, from the mixed second differences along x and y, which nearly vanish for a smooth surface. For robustness
+    the median of their moduli is used, not the mean.
 
     Raises:
         ValueError: if the threshold is not positive.

@@ -20,7 +20,7 @@ from .cases import Case
 Array = NDArray[np.float64]
 
 PATCHES = tuple(direction(np.array([30.0, -45.0, -15.0, -5.0, 10.0, 45.0, 60.0]), azimuth) for azimuth in (0.0, 90.0))
-"""Of each of the planes x and y, ω_i and six ω_o: (7, 3)."""
+"""ω_i and six ω_o in each of the planes x and y: (7, 3)."""
 
 
 def against_reference(height_field: HeightField, spectrum: GratingSpectrum) -> Record:

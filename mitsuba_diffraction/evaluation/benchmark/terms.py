@@ -81,7 +81,7 @@ class SeriesErrors:
     relative_errors: tuple[float, ...]
 
     def needed(self, tolerance: float) -> int:
-        """Return the smallest N from which on the error stays within the tolerance; the largest N if there is none."""
+        """Return the smallest N from which on the error stays within the tolerance; without one, the largest N."""
         above = [n for n, error in zip(self.terms, self.errors, strict=True) if not error <= tolerance]
         return min(max(above, default=self.terms[0] - 1) + 1, self.terms[-1])
 
@@ -177,7 +177,7 @@ class Method:
         name: of the method.
         terms: N, if it sums a series.
         transforms: FFTs of the tile behind the table; None if each evaluation takes its own.
-        words: of 32 bits read for one evaluation: of four wavelengths; of a shader, of one shading point.
+        words: of 32 bits read for one evaluation, of four wavelengths; for a shader, for one shading point.
         megabytes: of the table or the textures.
         error: ∫|ΔS| dq in float32, if S is what it computes; None for the reference.
         delta_e: (mean, maximum) CIEDE2000 of twelve patches of colour.
@@ -289,7 +289,7 @@ def affordable_transforms(fft: Method, evaluations: int) -> float:
 
 
 def _spectra(case: Case, series: Sequence[SeriesErrors]) -> dict[tuple[str, int | None], GratingSpectrum]:
-    """Return the spectra by representation and number of terms: those shown, and those that `TOLERANCE` needs."""
+    """Return spectra by representation and number of terms: the numbers shown, and the one that `TOLERANCE` needs."""
     slices = case.spectrum(TOLERANCE)
     result: dict[tuple[str, int | None], GratingSpectrum] = {("slices", None): slices}
     for errors in series:
@@ -436,7 +436,7 @@ def plot(found: Found) -> Figure:
 
 
 def _plot_bounds(panel: Axes, curves: Sequence[SeriesErrors]) -> None:
-    """Plot 2ε + ε² for Lagrange's ε of both origins, and for those that the thesis prints."""
+    """Plot 2ε + ε² for Lagrange's ε of both origins, and for the ε that the thesis prints."""
     for curve in curves:
         if (curve.representation, curve.precision) == ("taylor", "float64"):
             values = [power_bound(lagrange_bound(curve.phase, n)) for n in curve.terms]

@@ -38,7 +38,7 @@ class Comparison:
         scene: file name.
         shader: one of `VARIANTS`.
         others: further shaders.
-        settings: of the shaders: terms, window, interpolation; those that are not the default.
+        settings: of the shaders: terms, window, interpolation, where they differ from the default.
         variant: Mitsuba's.
         seed: of the random numbers.
         pictures: by name: "path_traced", "same_light" (the project's model under the lights that the shader supports),

@@ -190,7 +190,7 @@ def _traced(scene: mi.Scene, samples: int) -> tuple[Picture, float]:
     sums, passes = Accumulation.empty(rows, columns), split(scene, samples, 2)
     spectrum_to_XYZ(sums.radiance(), channel_wavelengths())  # loads the observer
     begin = clock()
-    # Of as many samples as the others, since kernels depend on their number.
+    # It has as many samples as the others, since kernels depend on their number.
     trace_pass(scene, passes[0], 0)
     compiled = clock()
     for index, some in enumerate(passes):

@@ -24,7 +24,7 @@ from .surfaces import Shaded, gratings_of, in_place, recipe_of, sum_along
 from .tristimulus import Emission
 
 PUBLISHED_BRIGHTNESS = 1000.0
-"""Of every variant of the published program, unless its slider is moved (github.com/simplay/Bachelor-Thesis)."""
+"""Every variant of the published program has it, unless its slider is moved (github.com/simplay/Bachelor-Thesis)."""
 
 PARAMETERS = (
     Parameter("variant", "string", "flss, nmm, pq, nmm_pq or gem", "flss"),

@@ -21,7 +21,7 @@ class NMM(FLSS):
 
     A grating of period d diffracts only the wavelengths λ_n = d u/n into a direction, n = N_min … N_max with
     N_min = d u/λ_max and N_max = d u/λ_min. The thesis enumerates them along u and along v without specifying how to
-    combine the two; here n runs along the axis with the larger |d_j u_j|, where d is the period of the tile, and the
+    combine the two. Here n runs along the axis with the larger |d_j u_j|, where d is the period of the tile, and the
     window covers the orders of the other axis. Order zero, (u, v) = (0, 0), contains all wavelengths: it is summed as
     in FLSS, with the texel of order zero only.
 

@@ -100,7 +100,7 @@ class PQ(TextureShader):
         radius: int = 1,
         **settings: Any,
     ) -> None:
-        """Set up the shader with the arguments of `TextureShader` and those below.
+        """Set up the shader with the arguments of `TextureShader` and the arguments below.
 
         Args:
             tiles: (P, Q); default: as many as the coherence length covers.

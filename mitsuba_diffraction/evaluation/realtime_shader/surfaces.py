@@ -134,7 +134,7 @@ def sum_along(
     active: mi.Bool,
     at_hit: Callable[[mi.SurfaceInteraction3f, mi.BSDFPtr, mi.Bool], tuple],
 ) -> tuple[tuple, mi.Bool]:
-    """Sum what a ray shows: the first surface that it hits, and through masks those behind.
+    """Sum what a ray shows: the first surface that it hits, and through masks the surfaces behind.
 
     Args:
         scene: the scene.

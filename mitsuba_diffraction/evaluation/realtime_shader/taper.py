@@ -11,8 +11,8 @@ equal for
 
     1/σ² = 1/σ_s² − 1/2s².
 
-For other c, such as the sum of a few positions, s² is its variance, and the equality an approximation: on the measured
-skins S differs by 3 to 5 % in the mean of its absolute value; without the taper by 4 to 50 %.
+For other c, such as the sum of a few positions, s² is the variance of c, and the equality is an approximation. On the
+measured skins S then differs by 3 to 5 % in the mean of its absolute value; without the taper, by 4 to 50 %.
 """
 
 from __future__ import annotations

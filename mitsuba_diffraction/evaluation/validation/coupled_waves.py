@@ -66,7 +66,7 @@ class RigorousResult:
         angle: of incidence, degrees; the light is incident from −x.
         material: "dielectric" (n = 1.5) or a metal by Mitsuba's name.
         index: n + ik.
-        orders: those that propagate, (n,).
+        orders: the orders that propagate, (n,).
         te, tm: rigorous efficiencies, (n,).
         change: of the efficiencies at the last refinement, as a fraction of the reflected power.
     """

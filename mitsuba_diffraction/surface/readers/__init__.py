@@ -106,7 +106,7 @@ def read_height_field(
         fill_missing: interpolate NaN or infinite pixels (`heightfield.harmonic_fill`), do not refuse them; `source`
             and `filled` of the height field report their number.
         channel: of a file with several (.gwy and instrument formats), by name or number. None selects the one that
-            holds lengths, or the first of those named height or topography; `source` reports which.
+            holds lengths, or the first one named height or topography; `source` reports which.
         unit: of lengths, e.g. "nm", for a file without one; ("um", "nm") if lateral lengths and heights differ.
             `pixel_size` is in µm in any case.
         keep_missing: keep missing pixels as NaN, for the steps of `prepare`.

@@ -1,8 +1,8 @@
 """Work-arounds for SurfaceTopography: valid files that it refuses or misreads are rewritten first.
 
 - .tmd: the comment has any length; the library reads 24 bytes.
-- .x3p (ISO 25178-72): a folder that was zipped, heights as text in main.xml, empty offsets, dates that are none, and
-  dashes in the revision are common; the library takes none of them.
+- .x3p (ISO 25178-72): a zipped folder, heights as text in main.xml, empty offsets, invalid dates, and dashes in the
+  revision are common; the library accepts none of them.
 - .sur: since 2010 the data may be compressed by zlib (DSCOMPRESSED).
 - .ibw: a wave of two dimensions is an image, unless its columns have names; the library wants it to be square. Heights
   may have no unit.

@@ -112,7 +112,7 @@ def _number(value: str) -> int:
 
 
 def _aspect(fields: dict[str, str]) -> float | None:
-    """Return width to length, as in `2:1` or `0.516`; None if there is none."""
+    """Return width to length, as in `2:1` or `0.516`; None without such an entry."""
     over, _, under = fields.get("aspect ratio", "").partition(":")
     try:
         aspect = float(over) / float(under or 1)

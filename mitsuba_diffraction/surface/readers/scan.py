@@ -111,7 +111,7 @@ def choose(channels: Sequence[Channel], wanted: str | int | None) -> Channel:
 
     Args:
         wanted: number, name or unique part of a name (case-insensitive). None selects the only channel of lengths, or
-            the first of those named as heights.
+            the first one named as heights.
     """
     if wanted is None:
         lengths = [channel for channel in channels if channel.is_length]

@@ -65,7 +65,7 @@ def _points(points: NDArray[np.float64], unit: str | tuple[str, str] | None) -> 
 
 
 def gridded(points: NDArray[np.float64]) -> tuple[NDArray[np.float64], tuple[float, float]]:
-    """Return the heights (N_y, N_x) of points on a regular grid, NaN where there is none, and its spacings."""
+    """Return the heights (N_y, N_x) of points on a regular grid, NaN for missing points, and its spacings."""
     if points.shape[1] != 3:
         raise RequestError(f"got {points.shape[1]} numbers in a line, wanted three: x y z")
     if not np.isfinite(points[:, :2]).all():
