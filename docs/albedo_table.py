@@ -26,7 +26,7 @@ PROFILES: dict[str, dict[str, Any]] = {
     "crossed": SQUARE,
 }
 SCALES = {"lateral_scale": 0.3, "height_scale": 1.7}
-COUNT, LARGEST = 512, 32  # directions; those of the largest albedos are measured again
+COUNT, LARGEST = 512, 32  # directions; the ones with the largest albedos are measured again
 SAMPLES, MORE_SAMPLES = 1 << 13, 1 << 17
 
 

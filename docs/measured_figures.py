@@ -1,4 +1,4 @@
-"""Figures of docs/validation.md: measured efficiencies of gratings, beside those of scalar and of rigorous theory.
+"""Figures of docs/validation.md: efficiencies of gratings as measured, by scalar theory and by rigorous theory.
 
 python docs/measured_figures.py docs/measured_gratings.png docs/measured_transmission.png
 """

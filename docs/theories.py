@@ -50,9 +50,10 @@ class TheoryCost:
         theory: "scalar" or "rigorous".
         build_seconds: of processor time, of `precompute`.
         megabytes: of the table.
-        error, max_error: Σ|Δη_m| / Σ η_m against the solver, that of the theory and that of the table, the mean and the
-            maximum over directions, uniform over the hemisphere, and wavelengths from 400 to 700 nm; unpolarised.
-        evaluate_ratio: speed of eval_pdf to that of roughconductor (Al), random directions, the same run.
+        error, max_error: Σ|Δη_m| / Σ η_m against the solver, including the errors of the theory and of the table; the
+            mean and the maximum over directions, uniform over the hemisphere, and wavelengths from 400 to 700 nm;
+            unpolarised.
+        evaluate_ratio: speed of eval_pdf relative to roughconductor (Al), random directions, the same run.
         lobe_ratio: the same with ω_o sampled by the grating.
         sample_ratio: of sample.
     """

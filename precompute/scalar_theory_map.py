@@ -39,7 +39,7 @@ SAMPLES = 512
 
 
 def solved(job: tuple[str, tuple[int, int], float, float]) -> tuple[float, float]:
-    """Return the error of scalar theory, and that of the rigorous efficiencies, for λ = 1 µm."""
+    """Return the error of scalar theory, and the error of the rigorous efficiencies, for λ = 1 µm."""
     material, (angle, azimuth), depth, period = job
     index, transmits, below = MATERIALS[material], material.startswith("transmitted"), material.endswith("below")
     sine = np.sin(np.deg2rad(angle)) / (index.real if below else 1)

@@ -5,7 +5,7 @@
     python scenes/gallery.py --write         # new references, after an intended change
     python scenes/gallery.py --compress      # previews in docs/gallery become JPEG files of less than 500 kB
 
-The commands are those of docs/gallery.md: first the scripts that generate the models, if they are missing, then each
+The commands are taken from docs/gallery.md: first the scripts that generate the models, if they are missing, then each
 `mitsuba-diffraction render … -o docs/gallery/NAME.exr`, at 160 × 90 pixels and 8 samples per pixel.
 
 Linear sRGB c is mapped to c/(c + m), where m is the mean of the reference, to limit the weight of fireflies, and

@@ -6,8 +6,8 @@ in its first order. With ω_i and ω_o the directions from the stripe to the lam
     (cos φ, sin φ)/(s T) = −(ω_i + ω_o)_∥/λ
 
 where φ is `orientation` and s `lateral_scale`. The first order has the fraction J_1(κa)² of the light: the amplitude a
-of the groove, and so `height_scale`, determines the brightness of the stripe. Lengths of the scene are cm, those of
-gratings µm.
+of the groove, and so `height_scale`, determines the brightness of the stripe. Lengths of the scene are in cm, lengths
+of gratings in µm.
 """
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ _GALLERY = Path(__file__).parents[1] / "docs" / "gallery"
 # A preview (.png), or what gallery.py makes of it.
 PICTURE = next(_GALLERY.glob("snake_xenopeltis_sun.[jp]*g"), _GALLERY / "snake_xenopeltis_sun.jpg")
 PERIOD, DEPTH = 1.5, 0.25  # µm, as in hologram.xml
-WIDTH = 16.0  # cm, of the hologram; its height is that of the picture
+WIDTH = 16.0  # cm, of the hologram; the picture determines its height
 WAVELENGTHS = np.array([0.620, 0.535, 0.460])  # µm, of the stripes
 BAND = 0.06  # relative width of the band of wavelengths that reaches the eye, by the width of the lamp
 LIGHT, EYE = (-12.0, 22.0, 52.0), (0.0, -44.0, 44.0)  # of hologram.xml

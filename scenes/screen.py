@@ -56,7 +56,7 @@ class Light:
         return cls(rgb, (float(column), float(row)))
 
     def distances(self, width: float) -> tuple[Array, Array]:
-        """Return the distances in pixels of spectrum and rows, (3,) each; `width` is that of the photograph."""
+        """Return the distances in pixels of spectrum and rows, (3,) each; `width` is the width of the photograph."""
         column, row = (round(x) for x in self.mirror)
         band = round(width / 50)
         along = self.rgb[row - band : row + band + 1].mean(0)

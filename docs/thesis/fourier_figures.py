@@ -1,4 +1,4 @@
-"""Figures 3.1 and 4.1 of the draft of the thesis of 2014: interpolated transforms, and those of powers of heights.
+"""Figures 3.1 and 4.1 of the draft of the thesis of 2014: interpolated transforms, and transforms of powers of heights.
 
 python docs/thesis/fourier_figures.py FOLDER
 """

@@ -54,7 +54,7 @@ METHODS = (PUBLISHED, CORRECTED, MODEL)
 SIDE, RADIUS = 800, 380
 """Pixels of a published picture, and of the radius of the disc, sin θ_o = 1."""
 ENCODINGS = ("sRGB", "gamma 2.5")
-"""Transfer functions: that of the published pictures, as their dark colours show, and that of the shader."""
+"""Transfer functions: of the published pictures, as their dark colours show, and of the shader."""
 _MIRROR = 0.1  # sin θ_o; the pictures are saturated nearer to the mirror direction
 _LIGHT = (0.0, 0.0, 1.0)
 _COHERENCE_LENGTH = 65.0
@@ -253,7 +253,7 @@ _HEIGHTS = np.arange(0.30, 0.92, 0.05)  # µm
 
 @dataclass(frozen=True, eq=False)
 class Row:
-    """A published map and those of this project.
+    """A published map and the maps of this project.
 
     Attributes:
         name: of the surface.
@@ -274,7 +274,7 @@ def row(name: str, step: int = 2, methods: Iterable[str] = METHODS) -> Row:
 
 
 def plot_maps(rows: Iterable[Row]) -> Figure:
-    """Plot the author's maps on the left and those of this project beside them, each titled with its correlation."""
+    """Plot the author's maps on the left and the maps of this project beside them, each titled with its correlation."""
     rows = list(rows)
     drawn = figure(3.1 * (1 + len(rows[0].maps)), 3.3 * len(rows))
     axes = drawn.subplots(len(rows), 1 + len(rows[0].maps), squeeze=False)

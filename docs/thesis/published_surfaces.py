@@ -61,7 +61,7 @@ class PublishedSurface:
 
     @property
     def shader_coherence_length(self) -> float:
-        """L_c of the shader in µm, which repeats a scan as a tile: that of sunlight, as published."""
+        """L_c of the shader in µm: where it repeats a scan as a tile, L_c of sunlight, as published."""
         return SUN_COHERENCE_LENGTH if self.recipe.settings.extent == "sample" else self.coherence_length
 
     def direction(self, angle: ArrayLike) -> NDArray[np.float64]:

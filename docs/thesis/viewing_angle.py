@@ -41,7 +41,7 @@ _R_0 = ((_INDEX - 1) / (_INDEX + 1)) ** 2
 
 
 def relative_reflectance(spectrum: GratingSpectrum, wi: ArrayLike, wo: ArrayLike, wavelengths: ArrayLike) -> Array:
-    """Return f cos θ_i of the BSDF, index 1.5, over that of a flat surface at normal incidence and exit.
+    """Return f cos θ_i of the BSDF, index 1.5, over f cos θ_i of a flat surface at normal incidence and exit.
 
         ρ(λ) = f cos θ_i · 2πσ_q² λ²/R₀ = R/R₀ · K G cos θ_i · 2πσ_q² S(q; κ) · E
 

@@ -331,7 +331,7 @@ def compact_disc(
     0.126 µm at 780 nm maximises contrast, λ/8n the tracking signal). The lengths of pits and lands are random with the
     maximum-entropy distribution under that constraint.
 
-    The pits are given as in the metal, where an instrument measures them without the polycarbonate. For a complete
+    Heights describe the pits of the metal, as an instrument measures them without the polycarbonate. For a complete
     disc, use `coat_ior` = 1.55 of the plugin.
 
     Args:
