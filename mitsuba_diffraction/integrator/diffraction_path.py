@@ -161,7 +161,7 @@ def _lit_gratings(scene: mi.Scene, sensor: mi.Sensor, max_depth: int) -> Grating
 def _is_black(bsdf: mi.BSDF | None) -> bool:
     """Return whether a surface reflects nothing, as lamps do by default, and shows no light cast by gratings."""
     return bsdf is None or (
-        bsdf.class_name() == "SmoothDiffuse" and all(not np.any(value) for _, value in mi.traverse(bsdf))
+        bsdf.class_name() == "SmoothDiffuse" and all(not np.any(np.array(value)) for _, value in mi.traverse(bsdf))
     )
 
 

@@ -34,6 +34,7 @@ NODES_AT_ONCE = 8  # the most along one axis that contribute at one q, as MAX_LO
 METALS = ("Al", "Ag", "Au", "Cr", "Cu", "W")
 """The conductors among which a page chooses, besides that of the surface."""
 
+DESIGN = "design of "  # in the title of a designed relief, see `inverse_design.result`
 _SKINS = ("elaphe", "xenopeltis")  # profiles
 
 # Radii of the hole, and of the inner and outer edge of the tracks, relative to 60 mm (IEC 60908, ECMA-267).
@@ -130,6 +131,8 @@ def _summary(surface: Surface) -> str:
     field = surface.recipe.height_field()
     size = " × ".join(f"{length:.3g}" for length in field.tile_size[: 2 if field.shape[0] > 1 else 1])
     kind = "Period" if surface.recipe.settings.extent == "tile" else "Sample of an irregular surface,"
+    if surface.spectrum.patches > 1:
+        kind = f"{surface.spectrum.patches} random patches of"
     return f"{kind} {size} µm, {field.height_range:.3g} µm deep."
 
 
@@ -137,6 +140,8 @@ def _shape(surface: Surface) -> str:
     """Return the object that is shown first: the snake for skins and samples of other irregular surfaces."""
     if _profile(surface) in _RINGS:
         return "disc"
+    if DESIGN in surface.spectrum.source:
+        return "wall"
     if surface.material.orientation in FROM_RADIUS:
         return "plate"
     return "coil" if surface.spectrum.extent == "sample" or _profile(surface) in _SKINS else "sphere"

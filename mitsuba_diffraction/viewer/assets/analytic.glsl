@@ -1,4 +1,5 @@
-// Position, normal and tangent of a sphere, a plate or a disc; they lie about the origin, with radius one. The fourth
+// Position, normal and tangent of a sphere, a plate or a disc; they lie about the origin, with radius one. A wall has those
+// of the plate that faces it from above, whose back hides a part of it. The fourth
 // component of a position is the coverage: of the grating one, of clear plastic beside it CLEAR.
 uniform int uShape;
 uniform vec3 uEye;
@@ -7,6 +8,7 @@ uniform vec2 uTangentOfView;
 uniform vec2 uJitter;
 uniform vec2 uSize;
 uniform bool uFromRadius;  // whether the tangent points away from the centre of UV space
+uniform vec4 uWall;        // height of the plate above the wall, half the sides of both, and zero
 uniform vec3 uRings;       // of a disc, between the radii of its hole, and of the inner and outer edge of its grating
 layout(location = 0) out vec4 oPosition;
 layout(location = 1) out vec4 oNormal;
@@ -42,6 +44,19 @@ void main() {
     vec2 outward = r > 0.0 ? p.xy / r : vec2(1.0, 0.0);
     vec2 uv = vec2(angleOf(p.xy), acos(clamp(p.z, -1.0, 1.0)) / PI);
     oTangent = tangentOf(uv, 2.0 * PI * vec3(-p.y, p.x, 0.0), PI * vec3(p.z * outward, -r));
+    return;
+  }
+  if (uShape == 3) {
+    oNormal = vec4(0.0, 0.0, -1.0, 0.0);
+    oTangent = vec4(-1.0, 0.0, 0.0, 0.0);
+    for (int k = 0; k < 2; k++) {
+      float distance = ((k == 0 ? uWall.x : 0.0) - uEye.z) / ray.z;
+      vec3 p = uEye + distance * ray;
+      if (distance > 0.0 && max(abs(p.x), abs(p.y)) <= (k == 0 ? uWall.y : uWall.z)) {
+        oPosition = vec4(p, 1.0);
+        return;
+      }
+    }
     return;
   }
   float t = -uEye.z / ray.z;

@@ -37,8 +37,7 @@ function sceneOf(data, state, coil) {
     <transform name="to_world"><scale x="${far * uLightSize[0]}" y="${far * uLightSize[1]}"/><lookat origin="${list(scaled(light, far))}" target="0, 0, 0" up="0, 0, 1"/></transform>
     <emitter type="area"><spectrum name="radiance" type="d65"><float name="scale" value="${1 / area}"/></spectrum></emitter>
   </shape>`;
-  const sky = state.sky > 0
-    ? `\n  <emitter type="constant"><spectrum name="radiance" type="d65"><float name="scale" value="${state.sky / Math.PI}"/></spectrum></emitter>` : "";
+  const sky = state.sky > 0 ? skyOf(state.sky / Math.PI, 2 * far) : "";
   const shape = { sphere: ["sphere", ""], plate: ["rectangle", ""], disc: ["disk", ""] }[state.shape] || ["ply",
     `<string name="filename" value="scenes/coil/snake.ply"/>
     <transform name="to_world"><translate value="${list(scaled(coil.middle, -1))}"/><scale value="${coil.scale.toFixed(6)}"/></transform>
@@ -46,19 +45,58 @@ function sceneOf(data, state, coil) {
   const bsdf = `<bsdf type="diffraction_grating">
       ${lines.join("\n      ")}
     </bsdf>`;
+  // Light that a grating casts on a wall is found by `diffraction_path`.
+  const [integrator, depth] = state.shape === "wall" ? ["diffraction_path", 3] : ["path", 2];
   const { width, height } = $("canvas");
   return `<scene version="3.0.0">
-${note}  <integrator type="path"><integer name="max_depth" value="2"/></integrator>
+${note}  <integrator type="${integrator}"><integer name="max_depth" value="${depth}"/></integrator>
   <sensor type="perspective">
     <float name="fov" value="${FIELD_OF_VIEW}"/><string name="fov_axis" value="smaller"/>
     <transform name="to_world"><lookat origin="${list(camera.eye)}" target="0, 0, 0" up="0, 0, 1"/></transform>
     <film type="hdrfilm"><integer name="width" value="${width}"/><integer name="height" value="${height}"/><rfilter type="box"/></film>
   </sensor>
-  <shape type="${shape[0]}">
+${state.shape === "wall" ? wallOf(state, bsdf) : `  <shape type="${shape[0]}">
     ${shape[1]}${state.shape === "disc" && data.rings ? ofRings(data.rings, state.coat, bsdf) : bsdf}
   </shape>
-  ${emitter}${sky}
+  ${emitter}`}${sky}
 </scene>`;
+}
+
+// A plate above a wall that it faces, and the torch at it.
+function wallOf(state, bsdf) {
+  const { height, side, wall, lamp } = PLATE;
+  const beam = (Math.atan(side / lamp) * 180) / Math.PI;
+  return `  <shape type="rectangle">
+    <transform name="to_world"><scale value="${side}"/><lookat origin="0, 0, ${height}" target="0, 0, 0" up="0, 1, 0"/></transform>
+    ${bsdf}
+  </shape>
+  <shape type="rectangle">
+    <transform name="to_world"><scale value="${wall}"/></transform>
+    <bsdf type="diffuse"><rgb name="reflectance" value="0.8"/></bsdf>
+  </shape>
+  <emitter type="spot"><float name="cutoff_angle" value="${beam.toFixed(3)}"/><float name="beam_width" value="${(0.99 * beam).toFixed(3)}"/>
+    <spectrum name="intensity" type="d65"/>
+    <transform name="to_world"><lookat origin="${list(lampOfPlate(state))}" target="0, 0, ${height}" up="1, 0, 0"/></transform>
+  </emitter>`;
+}
+
+const [GROUND, ZENITH] = [0.5, 5];  // as in model.glsl
+const SKY_DISCS = 12;
+
+// The sky: constant, and above the horizon discs one behind the other, each for its range of elevations.
+function skyOf(radiance, far) {
+  const of = (value) => `<spectrum name="radiance" type="d65"><float name="scale" value="${(radiance * value).toPrecision(6)}"/></spectrum>`;
+  const discs = Array.from({ length: SKY_DISCS }, (_, k) => {
+    const low = Math.max(1 - (k + 1) / SKY_DISCS, 0.01);
+    const [height, middle] = [far + 10 * k, 1 - (k + 0.5) / SKY_DISCS];
+    const radius = height * Math.sqrt(1 / low ** 2 - 1);
+    return `
+  <shape type="disk">
+    <transform name="to_world"><scale x="${radius.toFixed(1)}" y="${radius.toFixed(1)}"/><lookat origin="0, 0, ${height}" target="0, 0, 0" up="0, 1, 0"/></transform>
+    <emitter type="area">${of(GROUND + (ZENITH - GROUND) * middle ** 2)}</emitter>
+  </shape>`;
+  });
+  return `\n  <emitter type="constant">${of(GROUND)}</emitter>${discs.join("")}`;
 }
 
 // A texture that is one where u, of a disk the radius, lies between two numbers, and zero elsewhere.

@@ -9,21 +9,25 @@ const PREVIEW_SCALE = 0.25;
 
 const shapeOf = (data) => (data.shape === "coil" && !data.coil ? "sphere" : data.shape);
 
-// A skin on a snake, a disc beside a strip that casts its rainbows; other surfaces on a plate or a sphere, in a sky that
-// shows a metal as metal.
+// A skin on a snake, a designed plate before its wall, a disc beside a strip that casts its rainbows; other surfaces on a
+// plate or a sphere, in a sky that shows a metal as metal.
 function firstView(data) {
   if (shapeOf(data) === "coil") {
     return { azimuth: -60, elevation: 38, distance: 4.6, lightAzimuth: -20, lightElevation: 40,
       lightWidth: 8, lightLength: 0, sky: 0.05, hasBase: data.material.material === "", pigment: "#100c0a" };
   }
   const isDielectric = data.material.material === "";
+  if (shapeOf(data) === "wall") {
+    return { azimuth: -90, elevation: 50, distance: 5.2, lightAzimuth: -90, lightElevation: 70,
+      lightWidth: 0.5, lightLength: 0, sky: 0, hasBase: false, pigment: "#141a22" };
+  }
   if (shapeOf(data) === "disc") {
     return { azimuth: -90, elevation: 45, distance: 4.6, lightAzimuth: 0, lightElevation: 50,
       lightWidth: 5, lightLength: 50, sky: 0.05, hasBase: isDielectric, pigment: "#141a22" };
   }
   const lines = data.spectrum.max_order.includes(0);
   return { azimuth: -90, elevation: 20, distance: 5.2, lightAzimuth: -75, lightElevation: 35,
-    lightWidth: 6, lightLength: lines ? 60 : 0, sky: isDielectric ? 0.02 : 0.3, hasBase: isDielectric, pigment: "#141a22" };
+    lightWidth: 6, lightLength: lines ? 60 : 0, sky: isDielectric ? 0.02 : 0.5, hasBase: isDielectric, pigment: "#141a22" };
 }
 
 function initialState(data) {
@@ -52,6 +56,7 @@ function prepareControls(data, number) {
   $("surface").addEventListener("input", () => show(Number($("surface").value)));
   const options = [["dielectric", "dielectric"], ["none", "perfect mirror"], ...Object.keys(data.metals).map((m) => [m, m])];
   for (const [value, text] of options) $("material").add(new Option(text, value));
+  if (shapeOf(data) !== "wall") $("shape").querySelector("[value=wall]").remove();
   // The vertices of the coil have no texture coordinates.
   if (!data.coil || data.material.from_radius) $("shape").querySelector("[value=coil]").remove();
   $("orientation").disabled = data.material.from_radius;
@@ -272,7 +277,7 @@ function showTimes(renderer, state) {
 // The lamp where its direction is seen, just outside of the surface.
 function showLamp(state, width, height) {
   const camera = cameraOf(state, width, height);
-  const place = scaled(lightOf(state), LAMP_DISTANCE);
+  const place = state.shape === "wall" ? lampOfPlate(state) : scaled(lightOf(state), LAMP_DISTANCE);
   const depth = state.distance - dot(place, camera.back);
   const at = [camera.right, camera.up].map((axis, i) => dot(place, axis) / (depth * camera.tangents[i]));
   const clipped = at.map((x) => Math.min(Math.max(x, -0.97), 0.97));

@@ -33,6 +33,9 @@ const int MARGIN = 3;  // of the table, in nodes
 const float PI = 3.14159265358979;
 const float SHORTEST = 360.0, LONGEST = 830.0;
 const vec3 D65 = vec3(0.9505, 1.0, 1.089);
+const float GROUND = 0.5, ZENITH = 5.0;  // radiance of the sky below the horizon and at the zenith, relative to uSky
+
+mat3 frame;  // columns: the pattern's axes and the normal
 
 float horizonGain(float x) {
   float t = max(1.0 - 0.25 * x, 0.0);
@@ -189,6 +192,12 @@ float dielectric(float cosine) {
 // The face of the coat, at the cosine outside.
 float face(float cosine) {
   return dielectricOf(cosine, uCoat);
+}
+
+// Radiance of the sky in a direction along the pattern's axes, relative to uSky.
+float skyIn(vec3 direction) {
+  float up = max((frame * direction).z, 0.0);
+  return GROUND + (ZENITH - GROUND) * up * up;
 }
 
 // What enters a dielectric, through its coat.

@@ -32,7 +32,7 @@ class Picker {
     const local = (v) => axes.map((axis) => dot(axis, v));
     const mean = renderer.model.mean.read(...at, 1, 1);
     const xyz = [...mean.slice(0, 3)].map((value) => value / (mean[3] || 1));
-    return { wi: local(lightOf(state)), wo: local(unit(sum(camera.eye, scaled(position.slice(0, 3), -1)))), xyz };
+    return { wi: local(towardsLight(state)), wo: local(outgoingAt(state, camera, position.slice(0, 3))), xyz };
   }
 
   // f cos theta_i from 380 to 740 nm, in steps of 2 nm, of parallel light.
@@ -107,7 +107,7 @@ class Picker {
   plot(values, orders) {
     const peak = Math.max(...values.map(([, value]) => value), DARK);
     const x = (nm) => (((nm - 380) / 360) * 280).toFixed(1);
-    const y = (value) => (92 - (86 * value) / peak).toFixed(1);
+    const y = (value) => (92 - (74 * value) / peak).toFixed(1);
     const make = (name, attributes, text = "") => {
       const element = document.createElementNS("http://www.w3.org/2000/svg", name);
       for (const [key, value] of Object.entries(attributes)) element.setAttribute(key, value);
@@ -119,7 +119,7 @@ class Picker {
       .map(({ nanometres }) => make("line", { x1: x(nanometres), x2: x(nanometres), y1: 4, y2: 92, class: "mark" }));
     const axis = make("line", { x1: 0, x2: 280, y1: 92, y2: 92, class: "axis" });
     const labels = [400, 500, 600, 700].map((nm) => make("text", { x: x(nm), y: 106, "text-anchor": "middle" }, `${nm}`));
-    const top = make("text", { x: 2, y: 12 }, `f cos θ ${peak > DARK ? `up to ${peak.toPrecision(3)} sr⁻¹` : "in sr⁻¹: zero"}`);
+    const top = make("text", { x: 2, y: 10 }, `f cos θ ${peak > DARK ? `up to ${peak.toPrecision(3)} sr⁻¹` : "in sr⁻¹: zero"}`);
     const below = make("text", { x: 140, y: 120, "text-anchor": "middle" }, "wavelength in nm");
     $("plot").replaceChildren(axis, ...marks, line, ...labels, top, below);
   }

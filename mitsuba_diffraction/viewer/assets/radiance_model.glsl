@@ -4,12 +4,12 @@ uniform highp sampler2D uMatching;  // x, y, z and the light at each nm from 360
 uniform vec4 uSpectrum[48];         // of this frame: x, y, z times light times distance in nm, and lambda in nm
 uniform vec2 uIndices[48];          // n + ik there
 uniform vec3 uPigmentColour;        // XYZ of the pigment under the light
-uniform highp sampler2D uSkyColour; // XYZ of a surface under a sky of radiance one, by its cosine
+uniform highp sampler2D uNodes;     // of the table, to draw them: probability, alias, and weight (Vose 1991)
+uniform int uNodeCount;
 
 const float FIRST = 380.0, LAST = 740.0;  // nm
 const int POINTS = KIND != RESOLVED ? 16 : LIGHT == 0 ? 1 : 4, EACH = 3;
 
-mat3 frame;      // columns: the pattern's axes and the normal
 mat3 lightAxes;  // along them: half the width, half the length, and the direction of the light
 vec4 random;     // of this pixel and frame
 vec4 lightAt(int n);
@@ -113,6 +113,47 @@ vec4 lightFor(int n, vec3 wo) {
   return vec4(light.xyz, light.w * 0.5 * (high - low));
 }
 
+// Of the sky, by orders or splines drawn in proportion to their mean power, each at one wavelength.
+vec3 ofSky(vec3 wo, float transmitted) {
+  const int SAMPLES = 8;
+  int width = textureSize(uNodes, 0).x, columns = 2 * uMaxOrder.x + 1;
+  vec3 result = vec3(0.0);
+  for (int k = 0; k < SAMPLES; k++) {
+    vec4 u = fract(random.wzyx + float(k) * vec4(0.8566748838545, 0.7338918566271, 0.6287067210378, 0.5385972572236));
+    if (HAS_BASE) {
+      vec3 diffuse = vec3(sqrt(u.z) * vec2(cos(2.0 * PI * u.w), sin(2.0 * PI * u.w)), sqrt(1.0 - u.z));
+      result += skyIn(diffuse) * transmitted * transmittance(diffuse.z) * uPigmentColour;
+    }
+    float at = u.x * float(uNodeCount);
+    int index = min(int(at), uNodeCount - 1);
+    vec4 drawn = texelFetch(uNodes, ivec2(index % width, index / width), 0);
+    if (at - float(index) > drawn.x) {
+      index = int(drawn.y);
+      drawn = texelFetch(uNodes, ivec2(index % width, index / width), 0);
+    }
+    ivec2 m = ivec2(index % columns, index / columns) - uMaxOrder;
+    vec4 weights = uSpectrum[6 * k + int(5.999 * u.y)];
+    float lambda = 1e-3 * weights.w, perWidth = 1.0 / (lambda * uSigma);
+    vec2 offset = uSigma * sqrt(-2.0 * log(1.0 - u.z)) * vec2(cos(2.0 * PI * u.w), sin(2.0 * PI * u.w));
+    if (KIND == SPLINES) {
+      // The sum of three uniform numbers has the density of a quadratic B-spline.
+      vec2 v = u.zw;
+      offset = (v + fract(199.0 * v) + fract(39601.0 * v) - 1.5) / uPerPitch;
+    }
+    vec2 centre = vec2(m) / uPerPitch, tangent = lambda * (centre + offset), incident = -wo.xy - tangent;
+    float square = 1.0 - dot(incident, incident);
+    if (square <= 0.0) continue;
+    vec3 wi = vec3(incident, sqrt(square));
+    if (covered(wi, wo)) {
+      float value = KIND == RESOLVED || KIND == LINES ? orderFactor(wi, wo, centre * lambda, perWidth)
+                                                      : continuumFactor(wi, wo, tangent, perWidth);
+      value *= power(m, intervalsOf(wi, wo, 1.0 / lambda)) / drawn.z * reflectance(halfCosine(wi, wo), weights.w);
+      result += 48.0 * skyIn(wi) * value * (1.0 - face(wi.z)) * (1.0 - face(wo.z)) * weights.xyz;
+    }
+  }
+  return result / float(SAMPLES);
+}
+
 vec3 radiance(vec3 wo) {
   vec3 result = vec3(0.0);
   if (wo.z <= 0.0) return result;
@@ -131,10 +172,6 @@ vec3 radiance(vec3 wo) {
     result += wi.z * light.w * value;
   }
   result /= float(POINTS);
-  if (uSky > 0.0) {
-    float at = wo.z * float(textureSize(uSkyColour, 0).x - 1);
-    int below = int(min(floor(at), float(textureSize(uSkyColour, 0).x - 2)));
-    result += uSky * mix(texelFetch(uSkyColour, ivec2(below, 0), 0), texelFetch(uSkyColour, ivec2(below + 1, 0), 0), at - float(below)).xyz;
-  }
+  if (uSky > 0.0) result += uSky * ofSky(wo, transmitted);
   return result;
 }

@@ -68,7 +68,6 @@ class Renderer {
     const constants = (state) => this.constants(state);
     this.model = new Side(gl, SHADERS.model + SHADERS.radiance_model, constants, (state, frame) => this.modelUniforms(state, frame));
     this.programs = new Map();
-    this.skyColour = new Target(gl, 257, 1);
     this.coil = tables.coil;
     this.empty = gl.createVertexArray();
     this.shader = null;
@@ -110,16 +109,10 @@ class Renderer {
       ...this.spectrum.uniforms(state),
       ...wavelengthsOf(state, this.spectrum.materials[state.material], fraction(0.5 + frame * GOLDEN)),
       uMatching: this.matching,
-      uSkyColour: this.skyColour.textures[0],
       uSky: state.sky / Math.PI,
+      uNodes: this.spectrum.nodes,
+      uNodeCount: this.spectrum.nodeCount,
     };
-  }
-
-  drawSky(state) {
-    const { width } = this.skyColour;
-    this.skyColour.bind();
-    this.programOf(state, SHADERS.sky).use({ ...this.spectrum.uniforms(state), uMatching: this.matching, uLastTexel: width - 1 });
-    this.quad();
   }
 
   resize(width, height) {
@@ -165,6 +158,7 @@ class Renderer {
         uJitter: jitter,
         uSize: [width, height],
         uFromRadius: Number(state.fromRadius),
+        uWall: [PLATE.height, PLATE.side, PLATE.wall, 0],
         uRings: this.data.rings || [0, 0, 1],
       });
       this.quad();
@@ -187,7 +181,6 @@ class Renderer {
     const camera = cameraOf(state, width, height);
     const { frame } = side;
     this.drawGeometry(state, camera, frame);
-    if (side === this.model && frame === 0 && side.row === 0) this.drawSky(state);
     const turn = radians(state.orientation);
     const [uPosition, uNormal, uTangent] = this.geometry.textures;
     const [before, after] = side.means;
@@ -199,7 +192,8 @@ class Renderer {
       uBefore: before.textures[0],
       uWeight: 1 / (frame + 1),
       uEye: camera.eye,
-      uLight: lightOf(state),
+      uLight: towardsLight(state),
+      uPlate: plateOf(state),
       uLightSize: lightSizeOf(state).uLightSize,
       uRandom: randomOf(frame),
       uSin: Math.sin(turn),
@@ -288,7 +282,6 @@ class Renderer {
 
   // XYZ under parallel light for pairs, as above without lambda in use, the mean of some frames: (n, 4).
   evaluateColours(state, pairs, frames) {
-    this.drawSky(state);
     const program = this.programOf(state, SHADERS.radiance_model, SHADERS.pairs_model);
     const mean = new Float64Array((4 * pairs.length) / 7);
     for (let frame = 0; frame < frames; frame++) {

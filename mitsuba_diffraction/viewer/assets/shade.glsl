@@ -6,6 +6,7 @@ uniform highp sampler2D uBefore;
 uniform float uWeight;              // of this frame
 uniform vec3 uEye;
 uniform vec3 uLight;                // to the light
+uniform float uPlate;               // height of the plate above the wall that is seen; zero where the surface is seen
 uniform vec2 uLightSize;            // of LIGHT, parallel (0), a disc (1) or a strip (2): half its width and half its length at distance one
 uniform vec4 uRandom;               // of this frame
 uniform float uSin;                 // of the angle from the tangent to the pattern's x axis
@@ -38,7 +39,7 @@ vec4 lightAt(int n) {
 // XYZ of what the face of the coat mirrors: the light and the sky.
 vec3 mirrored(vec3 wo) {
   vec3 direction = vec3(-wo.xy, wo.z);
-  float radiance = uSky;
+  float radiance = uSky * skyIn(direction);
   if (LIGHT != 0) {
     vec2 at = vec2(dot(direction, lightAxes[0]), dot(direction, lightAxes[1])) / (uLightSize * uLightSize);
     at /= max(dot(direction, lightAxes[2]), 1e-9);
@@ -61,9 +62,11 @@ void main() {
     vec3 width = normalize(cross(vec3(0.0, 0.0, 1.0), uLight));
     lightAxes = mat3(uLightSize.x * (width * frame), uLightSize.y * (cross(uLight, width) * frame), uLight * frame);
     random = uRandom + vec4(hash(uvec2(at)), hash(uvec2(at) + 7919u), hash(uvec2(at) + 104729u), hash(uvec2(at) + 15485863u));
-    vec3 wo = normalize(uEye - position.xyz) * frame;
+    vec3 wo = normalize(uPlate > 0.0 ? position.xyz - vec3(0.0, 0.0, uPlate) : uEye - position.xyz) * frame;
     vec3 xyz = wo.z > 0.0 ? mirrored(wo) : vec3(0.0);
     if (position.w == 1.0) xyz += radiance(wo);
+    // A white wall receives cos^2/r^2, r the plate's height over the cosine; the back of the plate is black.
+    if (uPlate > 0.0) xyz *= position.z > 0.5 * uPlate ? 0.0 : wo.z * wo.z * wo.z * wo.z;
     value = position.w * vec4(xyz, 1.0);
   }
   vec4 before = texelFetch(uBefore, at, 0);

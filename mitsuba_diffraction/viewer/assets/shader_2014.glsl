@@ -25,7 +25,6 @@ uniform float uBrightness;             // of the diffraction alone; one for radi
 const float FIRST = 380.0, LAST = 780.0, STEP = 5.0;  // nm
 const int COUNT = 81;
 
-mat3 frame;      // columns: the pattern's axes and the normal
 mat3 lightAxes;  // along them: half the width, half the length, and the direction of the light
 vec4 random;     // of this pixel and frame
 vec4 lightAt(int n);

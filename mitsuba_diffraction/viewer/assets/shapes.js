@@ -1,6 +1,6 @@
-// The meshes of shapes; sphere, plate and disc are found by formula (analytic.glsl).
+// The meshes of shapes; the others are found by formula (analytic.glsl).
 
-const ANALYTIC = { sphere: 0, plate: 1, disc: 2 };
+const ANALYTIC = { sphere: 0, plate: 1, disc: 2, wall: 3 };
 
 class Mesh {
   // A sheet of points (rows, columns), closed along its rows; the tangent follows the columns.

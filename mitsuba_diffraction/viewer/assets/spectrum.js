@@ -60,10 +60,54 @@ function interleaved(values, [layers, terms, rows, columns]) {
   return result;
 }
 
+// Numbers of a table in half or single precision.
+function floatsOf({ values, type }) {
+  if (type !== "float16") return values;
+  const halves = Float32Array.from({ length: 65536 }, (_, bits) => {
+    const [exponent, fraction] = [(bits >> 10) & 31, bits & 1023];
+    const size = exponent === 0 ? fraction * 2 ** -24 : (1024 + fraction) * 2 ** (exponent - 25);
+    return bits & 32768 ? -size : size;
+  });
+  return Float32Array.from(values, (bits) => halves[bits]);
+}
+
+// Weights of the nodes of a table, the mean of their power over kappa, and how to draw them by Vose's alias method (1991):
+// (probability, alias, weight, 0) of each.
+function nodesOf(table) {
+  const [layers, terms, rows, columns] = table.shape;
+  const count = rows * columns;
+  const values = floatsOf(table);
+  const weights = new Float64Array(count);
+  for (let layer = 0; layer < layers; layer++) {
+    for (let i = 0; i < count; i++) weights[i] += Math.abs(values[layer * terms * count + i]);
+  }
+  const total = weights.reduce((a, b) => a + b, 0) / count || 1;
+  const nodes = new Float32Array(4 * count);
+  const [small, large] = [[], []];
+  for (let i = 0; i < count; i++) {
+    nodes[4 * i + 2] = weights[i] / (total * count);
+    weights[i] /= total;
+    (weights[i] < 1 ? small : large).push(i);
+  }
+  while (small.length && large.length) {
+    const [low, high] = [small.pop(), large[large.length - 1]];
+    nodes.set([weights[low], high], 4 * low);
+    weights[high] -= 1 - weights[low];
+    if (weights[high] < 1) small.push(large.pop());
+  }
+  for (const i of [...small, ...large]) nodes.set([1, i], 4 * i);
+  return nodes;
+}
+
 class Spectrum {
   constructor(gl, spectrum, table, materials) {
     Object.assign(this, { gl, spectrum, materials });
     const [layers, terms, rows, columns] = table.shape;
+    this.nodeCount = rows * columns;
+    const [width, height] = [Math.min(this.nodeCount, 2048), Math.ceil(this.nodeCount / 2048)];
+    const nodes = new Float32Array(4 * width * height);
+    nodes.set(nodesOf(table));
+    this.nodes = numbers2D(gl, nodes, width, height, 4);
     const padded = interleaved(table.values, table.shape);
     this.texture = numbers3D(gl, padded, columns + 2 * MARGIN, rows + 2 * MARGIN, layers, terms);
     this.bytes = padded.byteLength;
@@ -117,7 +161,6 @@ const bool CUBIC = ${this.terms === 4}, HAS_BASE = ${state.hasBase && dielectric
       uEta: state.index / state.coat,
       uIndex: metal ? metal.texture : this.noIndex,
       uPigment: state.hasBase ? pigmentOf(state.pigment) : [0, 0, 0],
-      uEntered: entered(state.index, state.coat),
     };
   }
 }
@@ -147,23 +190,4 @@ function wavelengthsOf(state, metal, offset) {
     indices.push(...(metal ? [0, 1].map((k) => at(metal.values, 2, nm, k) / state.coat) : [1, 0]));
   }
   return { uSpectrum: spectrum, uIndices: indices, uPigmentColour: pigment };
-}
-
-function fresnel(cosine, eta) {
-  const inside = Math.sqrt(Math.max(1 - (1 - cosine * cosine) / (eta * eta), 0));
-  const s = (cosine - eta * inside) / (cosine + eta * inside);
-  const p = (eta * cosine - inside) / (eta * cosine + inside);
-  return 0.5 * (s * s + p * p);
-}
-
-// The fraction of diffuse light that a plane lets in, through a coat.
-function entered(index, coat) {
-  const count = 64;
-  let sum = 0;
-  for (let i = 0; i < count; i++) {
-    const cosine = Math.sqrt((i + 0.5) / count);
-    const inside = Math.sqrt(1 - (1 - cosine * cosine) / coat ** 2);
-    sum += (1 - fresnel(cosine, coat)) * (1 - fresnel(inside, index / coat));
-  }
-  return sum / count;
 }

@@ -25,6 +25,18 @@ function cameraOf(state, width, height) {
 
 const lightOf = (state) => spherical(state.lightAzimuth, state.lightElevation);
 
+// A small plate above a wall casts light onto it; its lamp lies on the side of the wall.
+const PLATE = { height: 1.3, side: 0.06, wall: 1.2, lamp: 0.9 };
+const plateOf = (state) => (state.shape === "wall" ? PLATE.height : 0);
+const towardsLight = (state) => {
+  const [x, y, z] = lightOf(state);
+  return [x, y, state.shape === "wall" ? -z : z];
+};
+const lampOfPlate = (state) => sum([0, 0, PLATE.height], scaled(towardsLight(state), PLATE.lamp));
+// Where the light goes from a point of the picture: to the eye, or from the plate to that point of the wall.
+const outgoingAt = (state, camera, position) =>
+  unit(state.shape === "wall" ? sum(position, [0, 0, -PLATE.height]) : sum(camera.eye, scaled(position, -1)));
+
 // A strip, or a disc if it has no length.
 function lightSizeOf(state) {
   const half = (angle) => Math.tan(radians(angle / 2));
