@@ -177,7 +177,7 @@ def stripes(u: Array, v: Array) -> Array:
     across = np.abs(2 * v - 1)
     centre = np.where(u < (WAIST - TIP) / (FRONT - TIP), 0.40, 0.42)
     half = 0.115 * (1 + 0.25 * np.sin(9 * u))
-    stripe = smooth_step(np.abs(across - centre), half + 0.05, half - 0.03) * smooth_step(u, 0.03, 0.12)
+    stripe = smooth_step(np.abs(across - centre) - half, 0.05, -0.03) * smooth_step(u, 0.03, 0.12)
     return 1 + (STRIPE - 1) * stripe
 
 
