@@ -32,7 +32,7 @@ Real = NDArray[np.float64]
 Plane = Callable[[Real], tuple[Real, Real]]
 """R and T of unpolarised light at the cosines of the angles of incidence."""
 
-COSINES = 512  # nodes of the cosine at which a plane is tabulated
+COSINES = 512  # intervals of the cosine between which a plane is tabulated
 MAX_PHASE_STEP = 1.0  # radians between states of a stack whose thickness varies
 MAX_STATES = 9
 
@@ -145,13 +145,20 @@ class Stack:
         media = complex(self.outside), complex(self.below(wavelength).real)
         mean = sum(laterals) / 2
         low, high = (
-            scale * mean / lateral * (1 + sign * step * wavelength)
+            scale * mean / lateral * (1 + sign * step * wavelength / (mean * self.outside))
             for scale, lateral, sign in zip(self.scales, reversed(laterals), (-1, 1), strict=True)
         )
         phase = 4 * np.pi / wavelength * sum(n.real * thickness for n, thickness in films) * (high - low)
         count = min(1 + int(phase / (2 * MAX_PHASE_STEP)), MAX_STATES)
         scales = np.linspace(low, high, count) if count > 1 else [(low + high) / 2]
+        ratio = self.index(wavelength) ** side
         cosines = np.linspace(0, 1, COSINES + 1)
+        if ratio < 1:
+            # R and T are functions of the root of the distance from the critical angle.
+            critical = np.sqrt(1 - ratio**2)
+            distance = np.linspace(-1, 1, COSINES // 2 + 1)
+            near = critical + np.sign(distance) * distance**2 * np.where(distance < 0, critical, 1 - critical)
+            cosines = np.union1d(cosines, near)
         found: list[Plane] = []
         for scale in scales:
             layers = [(n, scale * thickness / wavelength) for n, thickness in films]
@@ -159,15 +166,10 @@ class Stack:
                 of_side = powers(cosines, media[1], layers[::-1], media[0])
             else:
                 of_side = powers(cosines, media[0], layers, media[1])
-            found.append(partial(_interpolated, np.mean(of_side, axis=1)))
+            found.append(partial(_interpolated, cosines, *np.mean(of_side, axis=1)))
         return found
 
 
-def _interpolated(table: Real, cosine: Real) -> tuple[Real, Real]:
-    """Return both rows of a table over equidistant cosines from 0 to 1, linear between them."""
-    x = np.clip(cosine, 0, 1) * COSINES
-    cell = np.minimum(x.astype(np.int64), COSINES - 1)
-    fraction = x - cell
-    low, high = table[:, cell], table[:, cell + 1]
-    reflected, transmitted = low + fraction * (high - low)
-    return reflected, transmitted
+def _interpolated(cosines: Real, reflected: Real, transmitted: Real, cosine: Real) -> tuple[Real, Real]:
+    """Return R and T of a table over cosines, linear between them."""
+    return np.interp(cosine, cosines, reflected), np.interp(cosine, cosines, transmitted)

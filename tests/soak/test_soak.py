@@ -3,7 +3,8 @@
     python -m pytest tests/soak                                    fixed seeds, about a minute
     python -m pytest tests/soak --soak 120 --soak-seed 1000        two hours, from a seed on
 
-A failure shows the configuration, shrunk, and the seed with which it is found again. It becomes a case in `CASES`.
+A failure shows the configuration and its seed; `--soak-seed` without `--soak` finds it again and shrinks it. It
+becomes a case in `CASES`.
 """
 
 import gc
@@ -73,7 +74,7 @@ def test_random_configurations(llvm, tmp_path, pytestconfig, capsys):
     while time.monotonic() < start + 60 * minutes:
         before = tried
         try:
-            tried += explore(seed, EXAMPLES, tmp_path)
+            tried += explore(seed, EXAMPLES, tmp_path, shrink=False)
         except Exception as error:
             faults.append(seed)
             with capsys.disabled():
@@ -89,14 +90,14 @@ def test_random_configurations(llvm, tmp_path, pytestconfig, capsys):
     assert not faults
 
 
-def explore(seed, examples, folder):
+def explore(seed, examples, folder, shrink=True):
     """Judge random configurations of a seed; return how many."""
     tried = []
 
     @hypothesis.seed(seed)
     @settings(
         max_examples=examples,
-        phases=[Phase.generate, Phase.shrink],
+        phases=[Phase.generate, *([Phase.shrink] if shrink else [])],
         deadline=None,
         database=None,
         derandomize=False,
