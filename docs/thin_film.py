@@ -2,8 +2,8 @@
 
 python docs/thin_film.py docs/thin_film.png docs/film_stack.png
 
-Curves and colours are those of the plugin, at the centres of lobes; points those of closed forms, J_m² K with R by the
-package tmm, and lines contours of R by tmm.
+Curves and colours are computed by the plugin, at the centres of lobes; points by closed forms, J_m² K with R by the
+package tmm. Lines are contours of R by tmm.
 """
 
 from __future__ import annotations

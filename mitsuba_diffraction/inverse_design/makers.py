@@ -50,7 +50,7 @@ def _triangles(points: Array) -> Array:
 
 
 def save_gds(design: Design, path: str | os.PathLike[str]) -> None:
-    """Write the texels of one period as GDSII in µm: those of level k on layer k, none for level 0.
+    """Write the texels of one period as GDSII in µm: texels of level k on layer k, none for level 0.
 
     Raises:
         ValueError: if the heights are not levels, or gdstk is not installed.
