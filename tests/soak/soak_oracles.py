@@ -64,10 +64,10 @@ class Case:
     def evaluate(self, wi, wo, texel, context=None, bsdf=None):
         return testing.evaluate_pdf(bsdf or self.bsdf, wi, wo, self.wavelengths, context, uv(texel))
 
-    def power(self, wi, wo, radiance):
-        """The sum of power; refracted radiance grows with n²."""
-        (n_i,), n_o = (self.model.indices(z > 0)[0] for z in (wi[2:], wo[:, 2]))
-        return (radiance * (n_o / n_i) ** 2).sum()
+    def powers(self, wi, wo, radiance):
+        """Power (n, c) from radiance, which grows with n² where it is refracted."""
+        (n_i,), n_o = (self.model.indices(z >= 0)[0] for z in (wi[2:], wo[:, 2]))
+        return radiance * ((n_o / n_i) ** 2)[:, None]
 
     @property
     def sides(self):
@@ -138,7 +138,7 @@ def value_is_that_of_the_model(case: Case):
         relative = relative + 3e-6 / (wavelength * model.sigma_q) + 2e-6 / cos**2 + 2e-6 / wi[2] ** 2
         enlarged = np.where(crosses, np.maximum(kappa, 1e-9), 1)
         enlarged = np.where(crosses, np.maximum(1, 0.25 * small / enlarged) ** 2, 1)
-        floor = 1e-7 / (2 * np.pi * model.sigma_q**2 * wavelength**2)
+        floor = (1e-7 if c.is_resolved else 2e-5) / (2 * np.pi * model.sigma_q**2 * wavelength**2)
         error = relative * (expected + base) + tolerance * slack / enlarged + floor
         worst = np.argmax((got - expected - base) / error)
         note = dict(wi=wi, wavelength=wavelength[0], below=below)
@@ -181,7 +181,11 @@ def _below(c):
 def gains_nothing(case, omega, wavelength, at):
     """Whether the light from a direction and its neighbours certainly is no more than incident, so that E is one."""
     c = case.c
-    model = Model(replace(c, material="none", film=None)) if c.transmission == "none" else case.model
+    # E is that of a perfect mirror, for all orders that propagate next to the relief.
+    inside = c.coat or c.outside
+    omega = np.array([*(omega[:2] * c.outside / inside), 0])
+    omega[2] = np.sqrt(1 - omega @ omega)
+    model = Model(replace(c, material="none", film=None, outside=inside, coat=None))
     theta, phi = np.arccos(np.clip(omega[2], -1, 1)), np.arctan2(omega[1], omega[0])
     totals = []
     for step in (0, -0.03, 0.03):
@@ -250,16 +254,23 @@ def samples_have_their_density_and_average_to_the_integral(case: Case):
         mirror(case, k)
 
 
+def mirror_reflectance(case: Case, wi):
+    """F of the face of a coat or of the flat face of a sheet, for light from ω_i; zero where there is none."""
+    c = case.c
+    if c.coat:
+        return plane(abs(wi[2]), c.outside, c.coat, 0.0, c.coat, 1.0)[0]
+    if c.transmission == "sheet" and wi[2] < 0:
+        return plane(abs(wi[2]), c.outside, c.material, 0.0, c.material, 1.0)[0]
+    return 0.0
+
+
 def mirror(case: Case, k):
     """The specular lobe of the face of a coat or sheet has the weight F."""
-    c, (wi, _) = case.c, case.directions[k]
+    wi, _ = case.directions[k]
     _, weight, _, is_delta = case.samples[k]
-    if c.coat:
-        expected = plane(abs(wi[2]), c.outside, c.coat, 0.0, c.coat, 1.0)[0]
-    elif c.transmission == "sheet" and wi[2] < 0:
-        expected = plane(abs(wi[2]), c.outside, c.material, 0.0, c.material, 1.0)[0]
-    else:
-        case.require(not is_delta.any(), "no mirror", k=k)
+    expected = mirror_reflectance(case, wi)
+    if not expected:
+        case.require(not is_delta.any(), "(b) no mirror", wi=wi)
         return
     got = np.where(is_delta[:, None], weight, 0)
     error = DEVIATIONS * got.std(0) / np.sqrt(SAMPLES) + 1e-3 * expected
@@ -303,7 +314,9 @@ def of_orders(case: Case):
                 area[start:end],
                 note=dict(order=order, wavelength=case.wavelengths[channel], centre=grid[start:end].mean(0)),
             )
-            total[k, channel] += case.power(wi, grid[start:end], value[start:end, channel] * area[start:end])
+            power = case.powers(wi, grid[start:end], value[start:end, [channel]] * area[start:end, None])
+            total[k, channel] += power.sum()
+        total[k] += mirror_reflectance(case, wi)
     if every == 1 and c.conserves_energy and c.base is None:
         bound(case, total)
 
@@ -337,7 +350,8 @@ def compare(case, k, contains, value, density, area, note):
     noise = DEVIATIONS * (np.sqrt(variance / SAMPLES) + grid_error(value)) + 10 * found.max(0) / SAMPLES
     ratio = np.where(density[:, None] > 0, value / np.maximum(density[:, None], 1e-30), 0)
     noise += 20 * ratio.max(0) / SAMPLES
-    bad = np.abs(found.mean(0) - integral) > noise + QUADRATURE * integral + 1e-7
+    floor = 1e-7 if case.c.is_resolved else 1e-4  # between narrow peaks of which the grid has none
+    bad = np.abs(found.mean(0) - integral) > noise + QUADRATURE * integral + floor
     case.require(not bad.any(), "(b) ∫ eval = mean weight", **note, integral=integral, mean=found.mean(0), noise=noise)
     undrawable = (density <= 0) & (value.sum(-1) > 0)
     case.require(value[undrawable].sum(0).max(initial=0) < 1e-4, "(c) light that is never drawn", **note, lost=integral)
@@ -360,7 +374,6 @@ def of_sphere(case: Case):
     sigma = np.min(case.wavelengths) * 1e-3 * case.model.sigma_q / c.densest
     per_sector = int(np.clip(np.ceil(2 * np.pi / 16 / (0.7 * sigma)), 10, 60))
     per_ring = int(np.clip(np.ceil(0.15 / (0.7 * sigma)), 8, 40))
-    total = np.zeros((len(case.directions), 4))
     for k, (wi, texel) in enumerate(case.directions):
         for below in case.sides:
             z, step = [], []
@@ -378,7 +391,6 @@ def of_sphere(case: Case):
             area = np.repeat(step * 2 * np.pi / count, count)
             value, density = case.evaluate(np.broadcast_to(wi, grid.shape), grid, texel)
             _check_finite(case, value, density)
-            total[k] += [case.power(wi, grid, of_channel * area) for of_channel in value.T]
             ring = np.clip(np.searchsorted(edges, np.abs(grid[:, 2]), side="right") - 1, 0, len(edges) - 2)
             sector = (np.arctan2(grid[:, 1], grid[:, 0]) % (2 * np.pi) / (2 * np.pi) * 16).astype(int) % 16
             for r in range(len(edges) - 1):
@@ -401,7 +413,13 @@ def of_sphere(case: Case):
                         note=dict(ring=(edges[r], edges[r + 1]), sector=s, below=below),
                     )
     if c.conserves_energy and c.base is None:
-        bound(case, total)
+        # From samples, whose density was just compared: the grid is too coarse for a sum over narrow peaks.
+        total, error = np.zeros((2, len(case.directions), 4))
+        for k, (wi, _) in enumerate(case.directions):
+            wo, weight, _, is_delta = case.samples[k]
+            power = case.powers(wi, np.where(is_delta[:, None], wi, wo), weight)
+            total[k], error[k] = power.mean(0), DEVIATIONS * power.std(0) / np.sqrt(SAMPLES)
+        bound(case, total - error)
 
 
 def bound(case: Case, total):
@@ -460,9 +478,9 @@ def same(case: Case, other, oracle, tolerance=2e-4, **numbers):
     """Whether another BSDF has the same values and densities."""
     for wi, wo, texel in pairs(case):
         a, b = case.evaluate(wi, wo, texel), case.evaluate(wi, wo, texel, bsdf=other)
-        for name, x, y in (("value", a[0], b[0]), ("pdf", a[1], b[1])):
+        for name, x, y, relative in (("value", a[0], b[0], tolerance), ("pdf", a[1], b[1], 10 * tolerance)):
             scale = max(x.max(initial=0), y.max(initial=0))
-            bad = np.abs(x - y) > tolerance * np.maximum(x, y) + 1e-5 * scale + 1e-12
+            bad = np.abs(x - y) > relative * np.maximum(x, y) + 1e-5 * scale + 1e-12
             j = np.argmax(bad.any(-1))
             case.require(
                 not bad.any(), oracle, what=name, wi=wi[j], wo=wo[j], got=y[j], wanted=x[j], count=bad.sum(), **numbers
@@ -589,9 +607,7 @@ def integrators_agree(case: Case):
             pixels = np.array(image, float).ravel()
             means[integrator], errors[integrator] = pixels.mean(), pixels.std() / PIXELS
         if "emitter samples" in means and name == "sky" and has_mirror:
-            n = c.coat or c.material
-            mirror = float(plane(abs(wi[2]), c.outside, n, 0.0, n, 1.0)[0])
-            means["emitter samples"] += mirror * luminance_of_one()
+            means["emitter samples"] += mirror_reflectance(case, wi) * luminance_of_one()
         for integrator in list(means)[1:]:
             error = DEVIATIONS * np.hypot(errors["path"], errors[integrator]) + QUADRATURE * means["path"]
             case.require(
