@@ -472,7 +472,13 @@ def test_inspect_takes_the_options_of_precompute(folder, command):
 def test_inspect_precompute_and_the_log_agree_on_the_error_of_scalar_theory(folder, command, llvm, caplog):
     Path("lamellar.toml").write_text('[surface]\nprofile = "lamellar"\nperiod = 1.6\ndepth = 0.2\nsamples = 64\n')
     said = [command("inspect lamellar.toml --json n.json")[1], command("precompute lamellar.toml")[1]]
-    mi.load_dict({"type": "diffraction_grating", "filename": "lamellar.toml"})
+    grating = {"type": "diffraction_grating", "filename": "lamellar.toml"}
+    shapes = {
+        "light": {"type": "constant"},
+        "sensor": {"type": "perspective"},
+        "plate": {"type": "rectangle", "bsdf": grating},
+    }
+    mi.load_dict({"type": "scene", **shapes})
     said.append("\n".join(record.getMessage() for record in caplog.records))
     warned = [re.findall(r"[Ss]calar theory: (errs by .*right)", text) for text in said]
     assert warned[0] == warned[1] == warned[2]

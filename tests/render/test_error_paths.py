@@ -3,7 +3,6 @@
 import re
 import sys
 from types import SimpleNamespace
-from zipfile import ZipFile
 
 import numpy as np
 import pytest
@@ -11,9 +10,8 @@ from bsdf_support import use
 from test_render import CONSTANT, SENSOR, SPHERE, write_scene
 
 from mitsuba_diffraction.errors import RequestError
-from mitsuba_diffraction.files import UNSEALED
 from mitsuba_diffraction.render import cluster, denoise, film, passes, render
-from mitsuba_diffraction.render.passes import Accumulation, load_checkpoint, save_checkpoint, split
+from mitsuba_diffraction.render.passes import split
 from mitsuba_diffraction.render.scene import load_spectral_scene
 from mitsuba_diffraction.render.spectral_image import SpectralImage
 
@@ -84,14 +82,6 @@ def test_pixels_that_cannot_be_are_named(luminance, message, caplog):
     passes._warn_of_implausible_pixels(picture, 1e4)
     assert caplog.messages
     assert re.search(message, caplog.text)
-
-
-def test_a_checkpoint_that_was_changed_is_refused(tmp_path):
-    path = tmp_path / "picture.exr.checkpoint"
-    save_checkpoint(path, "digest", Accumulation.empty(2, 3))
-    with ZipFile(path, "a") as archive:
-        archive.comment = UNSEALED.encode()
-    one_line("a damaged one .its contents do not match its digest", lambda: load_checkpoint(path, "digest"))
 
 
 def test_pictures_that_are_none(tmp_path):

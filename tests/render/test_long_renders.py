@@ -471,7 +471,7 @@ def test_the_command_announces_long_renderings_and_takes_an_exposure(command, mo
     monkeypatch.setattr(module, "_MIN_ANNOUNCED_SECONDS", 0)
     code, out, err = command(f"{RENDER} -o out.exr --spp 4")
     assert code == 0
-    assert "16 × 16 pixels, 4 samples per pixel: about 0 min, 0.0006 GB of memory" in err
+    assert "16 × 16 pixels, 4 samples per pixel: about 0 min, 0.00022 GB of memory" in err
     assert "a picture of 0.049 MB before compression" in err
     assert len(err.splitlines()) == 1
     assert re.search(r"exposed by \+?(-?\d+\.\d\d) stops \(--exposure \1\)", out)
@@ -522,10 +522,10 @@ def test_a_full_disk_is_one_line_and_keeps_the_last_checkpoint(command, monkeypa
 
 @pytest.fixture
 def small_disk(tmp_path):
-    """A disk of 300 kB."""
+    """A disk of 150 kB."""
     place = tmp_path / "disk"
     place.mkdir()
-    done = subprocess.run(["mount", "-t", "tmpfs", "-o", "size=300k", "tmpfs", place], capture_output=True)
+    done = subprocess.run(["mount", "-t", "tmpfs", "-o", "size=150k", "tmpfs", place], capture_output=True)
     if done.returncode:
         pytest.skip("nothing may be mounted here")
     yield place
@@ -534,7 +534,7 @@ def small_disk(tmp_path):
 
 def test_a_disk_that_the_picture_fills_is_one_line(command, small_disk, monkeypatch):
     monkeypatch.setattr(passes, "MIN_CHECKPOINT_INTERVAL", 0)  # after each pass, however long a checkpoint takes
-    # A checkpoint is 200 kB, two of them do not fit; a larger picture does not fit at all.
+    # A checkpoint is 100 kB, two of them do not fit; a larger picture does not fit at all.
     code, out, err = command(f"{RENDER} --spp 6 -o disk/out.exr --checkpoint 0")
     assert (code, out) == (1, "")
     assert "disk/out.exr.checkpoint: cannot be written (No space left on device)" in err

@@ -344,7 +344,10 @@ def test_a_build_succeeds_without_a_usable_checkpoint(tmp_path, monkeypatch):
         ({"int_ior": None}, "wanted one of the two"),
         ({"theory": "exact"}, "theory: got 'exact'"),
         ({"transmission": "glass"}, "transmission: got 'glass', wanted one of none, interface, sheet"),
-        ({"transmission": "sheet", "int_ior": None, "material": "Al"}, "sheet and int_ior None, wanted a dielectric"),
+        (
+            {"transmission": "sheet", "int_ior": None, "material": "Al"},
+            "sheet with material 'Al' and int_ior None, wanted a dielectric",
+        ),
         ({"transmission": "interface", "ext_ior": 1.3}, "and ext_ior 1.3, wanted no coat"),
         ({"theory": "scalar"}, "wanted none of them"),
         ({"height_field": gratings.crossed(2.0, 0.2, samples=8)}, "rows that differ"),
