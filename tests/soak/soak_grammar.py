@@ -310,7 +310,7 @@ def configurations(draw):
     if sample:
         coherence = draw(_rounded(2.0, 4.0))
     elif lateral != 1:
-        coherence = round(max(draw(_rounded(8.5, 30)) * longest, 16.0), 2)
+        coherence = round(max(draw(_rounded(8.5, 30)) * max(surface.period), 16.0), 2)  # not even unscaled ones overlap
     else:
         coherence = draw(
             st.one_of(

@@ -33,7 +33,8 @@ def index_of(material, wavelength):
 def plane(cosine, n_0, n_1, thickness, n_2, wavelength):
     """R and T of a plane under a film, unpolarised (Airy). n_0 is real; shapes broadcast."""
     n_0, n_1, n_2 = (np.asarray(n, complex) for n in (n_0, n_1, n_2))
-    sine = n_0 * np.sqrt(np.maximum(1 - np.asarray(cosine, float) ** 2, 0))
+    cosine = np.clip(np.asarray(cosine, float), 1e-6, 1)
+    sine = n_0 * np.sqrt(1 - cosine**2)
 
     def normal(n):
         root = np.sqrt(n**2 - sine**2)  # n cos θ, decaying where it is complex

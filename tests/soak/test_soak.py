@@ -22,7 +22,7 @@ pytestmark = [
     pytest.mark.filterwarnings("ignore:terms"),
     pytest.mark.filterwarnings("ignore:sample of"),
 ]
-FIXED_SEED, FIXED_EXAMPLES = 1, 20
+FIXED_SEED, FIXED_EXAMPLES = 1, 4
 EXAMPLES = 20  # of each seed of a long run
 SINUSOID = Surface("sinusoid", (2.5, 2.5), 0.3)
 CASES = {
