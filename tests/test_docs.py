@@ -23,7 +23,7 @@ from mitsuba_diffraction.evaluation.realtime_shader.quirks import Quirks
 ROOT = Path(__file__).parents[1]
 PACKAGE = Path(md.__file__).parent
 PAGES = [ROOT / "README.md", *sorted((ROOT / "docs").glob("*.md"))]
-SLOW = {"compare", "design", "long_renders", "own_grating", "own_scan", "plugin", "reading_exr", "tolerance"}
+SLOW = {"compare", "design", "long_renders", "own_grating", "own_scan", "plugin", "reading_exr", "tolerance", "viewer"}
 """Pages whose code takes long."""
 BLOCK = re.compile(r"^(?P<indent> *)```(?P<language>\w+)\n(?P<body>.*?)^ *```$", re.DOTALL | re.MULTILINE)
 REDUCED = {

@@ -254,7 +254,7 @@ def test_spectra_of_eta_and_k_are_those_of_the_conductor(llvm):
     )
 
 
-@pytest.mark.parametrize("transmission", ["interface", "sheet"])
+@pytest.mark.parametrize("transmission", [pytest.param("interface", marks=pytest.mark.slow), "sheet"])
 def test_a_medium_with_dispersion_is_a_constant_one_at_each_wavelength(llvm, transmission):
     """Directions, powers, densities and E at λ are those of a grating whose index is that at λ, for light of one λ."""
     common = {"profile": "blazed", "period": 2.5, "depth": 0.25, "ext_ior": 1.0, "transmission": transmission}

@@ -443,7 +443,7 @@ def test_the_scene_of_a_disc_has_its_rings(disc, opened, tmp_path, llvm):
     assert 0.6 < metal < 0.95
 
 
-@pytest.mark.few(1)
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("source", "parameters", "changes"),
     [
