@@ -1,4 +1,4 @@
-"""Take docs/viewer.png: a live page in Chromium.
+"""Take docs/viewer.png: a live page in Chromium, as it opens.
 
     python docs/viewer_picture.py docs/viewer.png
     python docs/viewer_picture.py --dark --width 390 --height 844 phone.png
@@ -14,25 +14,13 @@ from pathlib import Path
 from live_browser import draw, opened
 from live_pages import SURFACES
 
-VIEW = {
-    "shape": "coil",
-    "azimuth": -60,
-    "elevation": 38,
-    "distance": 4.6,
-    "lightAzimuth": -20,
-    "lightElevation": 40,
-    "lightWidth": 8,
-    "sky": 0.05,
-    "hasBase": True,
-    "pigment": "#20160c",
-}
-FRAMES = 4
+FRAMES = 6
 
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("output", type=Path)
-    parser.add_argument("--surface", choices=SURFACES, default="xenopeltis")
+    parser.add_argument("--surface", choices=SURFACES, default="compact_disc")
     parser.add_argument("--with", dest="right", default="none", help="the other side: flss, nmm, …")
     parser.add_argument("--dark", action="store_true")
     parser.add_argument("--width", type=int, default=960)
@@ -40,7 +28,7 @@ def main() -> None:
     options = parser.parse_args()
     size = {"width": options.width, "height": options.height}
     with opened(options.surface, viewport=size, color_scheme="dark" if options.dark else "light") as tab:
-        draw(tab, {**VIEW, "right": options.right}, FRAMES)
+        draw(tab, {"right": options.right}, FRAMES)
         tab.screenshot(path=options.output)
 
 
