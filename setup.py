@@ -17,9 +17,9 @@ class BuildWithExamples(build_py):
         examples = Path(self.build_lib) / "mitsuba_diffraction" / "examples"
         shutil.rmtree(examples, ignore_errors=True)
         for folder in ("scenes", "precompute"):
-            # What the scenes' scripts and earlier renderings left, and what judges figures of the manual; textures of
-            # the scenes lie in folders of their own.
-            left = shutil.ignore_patterns("models", "out", "gallery.*", "published", "__pycache__", ".*")
+            # What the scenes' scripts and earlier renderings left, what judges figures of the manual, and the word of
+            # the gallery, which is too large; textures of the scenes lie in folders of their own.
+            left = shutil.ignore_patterns("models", "out", "gallery.*", "published", "diffract.*", "__pycache__", ".*")
             shutil.copytree(folder, examples / folder, ignore=left)
             for picture in (examples / folder).glob("*.exr"):
                 picture.unlink()
