@@ -19,7 +19,7 @@ from ..inverse_design.output import SUFFIXES, save
 from ..inverse_design.plate import for_detail
 from ..outputs import check_outputs, free_name
 from ..progress import progress_bar, say, show, table, tell
-from .arguments import Overwrite, check_suffix, numbers
+from .arguments import Overwrite, check_suffix, converted, numbers
 from .render import Stopped
 
 _MIN_SAID_TIME = 90.0  # s, that a search takes
@@ -46,7 +46,8 @@ def design(
         str | None, typer.Option(help="nm: one of a laser, several (450,550) or first:last:step; default: white light")
     ] = None,
     int_ior: Annotated[
-        float | None, typer.Option(help="index of a sheet that transmits the light; default: the relief reflects")
+        str | None,
+        typer.Option(help="index of a sheet that transmits the light: a number, a name such as PMMA, or a file"),
     ] = None,
     seen_on: Annotated[
         str, typer.Option(help="wall (seen from the side of the plate) or screen (translucent, from the other side)")
@@ -95,7 +96,7 @@ def design(
             height_range,
             angle,
             wavelengths,
-            int_ior,
+            None if int_ior is None else converted(int_ior),
             levels,
             seen_on=seen_on,
             unused=unused,

@@ -6,8 +6,10 @@ import math
 from dataclasses import dataclass
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 from ..errors import RequestError, check_whole, is_number
+from ..materials import index_of
 from ..settings import MIN_WAVELENGTH, VISIBLE
 from .far_field import Array, blurred_texels
 
@@ -59,7 +61,7 @@ class Plate:
     height_range: float
     angle: float
     wavelengths: Array
-    int_ior: float | None
+    int_ior: float | str | None
     levels: int | None
     tool_blur: float
     seen_on: str = "wall"
@@ -76,8 +78,10 @@ class Plate:
                 f"angle: got {self.angle!r}, wanted degrees above 0 and below 45, where the corners of the picture are "
                 "at the horizon"
             )
-        if self.int_ior is not None and not (is_number(self.int_ior) and 1 < self.int_ior <= 10):
-            raise RequestError(f"int_ior: got {self.int_ior!r}, wanted an index above 1, or none for a mirror")
+        if self.int_ior is not None:
+            n = index_of("int_ior", self.int_ior)(self.wavelengths * 1e-3)
+            if n.imag.any() or not (1 < n.real.min() <= n.real.max() <= 10):
+                raise RequestError(f"int_ior: got {self.int_ior!r}, wanted an index above 1, or none for a mirror")
         if self.levels is not None:
             check_whole("levels", self.levels, 2)
         if self.tool_blur > self.period / 8:
@@ -148,8 +152,16 @@ class Plate:
         2π (1 + cos θ)/λ. For a sheet whose relief the light meets first, 2π (1 − √(n² − sin² θ))/λ, which is negative.
         """
         sine = math.sin(math.radians(self.angle)) / 2
-        path = 1 + math.sqrt(1 - sine**2) if self.int_ior is None else 1 - math.sqrt(self.int_ior**2 - sine**2)
+        wavelengths = self.wavelengths * 1e-3
+        path = (
+            1 + math.sqrt(1 - sine**2) if self.int_ior is None else 1 - np.sqrt(self.index(wavelengths) ** 2 - sine**2)
+        )
         return 2 * np.pi * path / (self.wavelengths * 1e-3)
+
+    def index(self, wavelengths: ArrayLike) -> Array:
+        """Return n of a sheet at wavelengths in µm."""
+        assert self.int_ior is not None
+        return index_of("int_ior", self.int_ior)(wavelengths).real
 
     @property
     def path(self) -> float:

@@ -147,7 +147,8 @@ class Design:
 
 def _relief(heights: Array, plate: Plate, blur_scale: float = 1.0) -> HeightField:
     """Return one period of the relief, in pixels of at most `_PIXEL`; inside a sheet wavelengths are shorter."""
-    pixel = _PIXEL * plate.light[0] * 1e-3 / (plate.int_ior or 1.0)
+    index = 1.0 if plate.int_ior is None else float(plate.index(plate.wavelengths * 1e-3).max())
+    pixel = _PIXEL * plate.light[0] * 1e-3 / index
     per_texel = max(4, math.ceil(plate.texel / pixel))
     spread = plate.spread(per_texel, blur_scale)
     source = f"design of {plate.texels} × {plate.texels} texels of {plate.texel:g} µm"
@@ -169,7 +170,9 @@ def _far_field(relief: HeightField, plate: Plate, wavelengths: Array, bins: int)
             m = m[found.kept]
             power = found.k_g * powers(m, 2 * np.pi * found.v_z / wavelength)
         else:
-            orders = transmitted_orders(powers, 2 * (plate.period,), wavelength, 0.0, plate.int_ior, sheet=True)
+            orders = transmitted_orders(
+                powers, 2 * (plate.period,), wavelength, 0.0, float(plate.index(wavelength)), sheet=True
+            )
             m, power = orders.m, orders.unpolarised
         power = power / power.sum()
         along_x, along_y = (lobes_in_bins(edges, one, plate.period, wavelength, plate.coherence_length) for one in m.T)

@@ -353,3 +353,15 @@ CENTRE[31:34, 31:34] = 1
 def test_mistakes_are_refused(target, options, message):
     with pytest.raises(ValueError, match=message):
         md.design(target, **options)
+
+
+def test_a_sheet_with_dispersion_has_the_phase_of_each_wavelength():
+    """κ of undiffracted light is 2π (1 − n)/λ, with n of the medium at λ."""
+    common = {"texel": 1.0, "texels": 8, "height_range": 1.0, "wavelengths": (450.0, 650.0), "starts": 1}
+    plate = md.design(np.eye(4), int_ior="PMMA", angle=20, **common).plate
+    for wavelength, kappa in zip((0.45, 0.65), plate.kappa, strict=True):
+        square = 1 + 1.1819 * wavelength**2 / (wavelength**2 - 0.011313)  # Sultanova et al. 2009
+        sine = np.sin(np.radians(20)) / 2
+        assert kappa == pytest.approx(2 * np.pi * (1 - np.sqrt(square - sine**2)) / wavelength, rel=1e-4)
+    with pytest.raises(ValueError, match="int_ior: got 'glass', wanted a number, a file or one of BK7"):
+        md.design(np.eye(4), int_ior="glass", angle=20, **common)
