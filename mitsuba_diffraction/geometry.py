@@ -150,22 +150,3 @@ def fresnel(cosine: ArrayLike, index: complex) -> tuple[NDArray[np.float64], NDA
     s = (cosine - root) / (cosine + root)
     p = (index**2 * cosine - root) / (index**2 * cosine + root)
     return np.abs(s) ** 2, np.abs(p) ** 2
-
-
-def transmitted(
-    cos_i: Array, cos_o: Array, tangent_square: Array, index: float, min_v_z: ArrayLike = 0.0
-) -> NDArray[np.float64]:
-    """Return K G (1 − F) of transmitted light; shapes broadcast, lengths in units of n_i.
-
-    Args:
-        cos_i, cos_o: |cos θ_i| and |cos θ_o|, positive.
-        tangent_square: |ω_i,∥ + η ω_o,∥|² = |λq|², λ in the medium of ω_i.
-        index: η = n_o/n_i.
-        min_v_z: lower bound of |v_z| in K.
-    """
-    square = tangent_square + (cos_i - index * np.asarray(cos_o)) ** 2
-    cos_half = np.abs(square + 1 - index**2) / (2 * np.sqrt(square))
-    factor = k_g(
-        cos_i, index * np.asarray(cos_o), tangent_square, 1 - index**2, False, min_v_z=np.maximum(min_v_z, 1e-6)
-    )
-    return factor * (1 - np.mean(fresnel(np.minimum(cos_half, 1), index), axis=0))
