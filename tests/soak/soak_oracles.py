@@ -487,7 +487,7 @@ def same(case: Case, other, oracle, tolerance=2e-4, density=True, reference=None
             : 1 + density
         ]:
             scale = max(x.max(initial=0), y.max(initial=0))
-            error = relative * np.maximum(x, y) + 1e-5 * scale + 1e-12
+            error = relative * np.maximum(x, y) + 1e-5 * scale + 1e-6
             bad = np.abs(x - y) > error
             if bad.any():
                 # Rounded indices decide on which side of the horizon an order is.
