@@ -20,8 +20,8 @@ from numpy.typing import NDArray
 
 import mitsuba_diffraction as md
 from mitsuba_diffraction.cli.design import read_target
-from mitsuba_diffraction.inverse_design.build import far_field_of
 from mitsuba_diffraction.inverse_design.plate import Plate
+from mitsuba_diffraction.inverse_design.search import far_field_of
 from mitsuba_diffraction.inverse_design.target import wanted_fractions
 
 CAT = Path(__file__).parents[1] / "precompute" / "designed" / "cat.png"

@@ -15,7 +15,7 @@ from mkdocs.config.defaults import MkDocsConfig
 from mkdocs.structure.files import File, Files
 
 from mitsuba_diffraction.viewer.page import page
-from mitsuba_diffraction.viewer.surface import Surface
+from mitsuba_diffraction.viewer.viewed_surface import Surface
 
 RECIPES = Path(__file__).parents[1] / "precompute"
 SURFACES = {

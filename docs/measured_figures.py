@@ -30,7 +30,7 @@ def plot_ruled(step: float = 4.0) -> Figure:
         wavelengths, wanted = ruled.measured(name)
         fine = np.arange(wavelengths[0], wavelengths[-1], 1e-3 * step)
         for theory, style in STYLES.items():
-            angle, rms = ruled.stored_angles()[name][theory], ruled.difference(name, theory).measured
+            angle, rms = ruled.stored_angles()[name][theory], ruled.rms_from_measured(name, theory).measured
             label = f"{theory} theory, facets of {angle:.1f}°: rms {rms:.3f}"
             panel.plot(1e3 * fine, ruled.littrow(name, angle, fine, theory == "rigorous"), label=label, **style)
         panel.plot(1e3 * wavelengths, wanted, "o", color="black", markersize=3.5, label="measured")

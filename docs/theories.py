@@ -23,8 +23,8 @@ from mitsuba_diffraction.llvm import choose_variant
 from mitsuba_diffraction.precomputation import Spectrum, precompute
 from mitsuba_diffraction.progress import Progress, progress_bar, show, silent, table
 from mitsuba_diffraction.rigorous import efficiencies, refractive_index
-from mitsuba_diffraction.rigorous.spectrum import RigorousSpectrum
-from mitsuba_diffraction.scalar_theory import difference, profile_powers, scalar_orders
+from mitsuba_diffraction.rigorous.rigorous_spectrum import RigorousSpectrum
+from mitsuba_diffraction.scalar_theory import efficiency_difference, profile_powers, scalar_orders
 from mitsuba_diffraction.surface.gratings import ruled
 from mitsuba_diffraction.surface.heightfield import HeightField
 
@@ -116,8 +116,8 @@ def _errors(height_field: HeightField, table: RigorousSpectrum) -> dict[str, lis
         index = refractive_index(wavelength, material=_METAL)
         exact = efficiencies(height_field, omega, wavelength, int_ior=index, tolerance=2e-3)
         scalar = scalar_orders(powers, period, wavelength, np.rad2deg(angle), index, 360 * azimuth)
-        errors["scalar"].append(difference(scalar.unpolarised, exact.unpolarised))
-        errors["rigorous"].append(difference(table.efficiencies(omega, wavelength)[1], exact.unpolarised))
+        errors["scalar"].append(efficiency_difference(scalar.unpolarised, exact.unpolarised))
+        errors["rigorous"].append(efficiency_difference(table.efficiencies(omega, wavelength)[1], exact.unpolarised))
     return errors
 
 

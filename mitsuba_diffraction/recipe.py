@@ -48,11 +48,11 @@ from typing import Any
 
 from .errors import RequestError, check_whole
 from .files import cache_folder, refuse_special
-from .grating_spectrum import FORMAT_VERSION, GratingSpectrum
+from .grating_spectrum import SCALAR_FORMAT_VERSION, GratingSpectrum
 from .materials import is_file
 from .precomputation import Spectrum, build_spectrum, load_spectrum
 from .progress import Progress, no_progress, part, silent, stage
-from .rigorous import build as rigorous
+from .rigorous import build_table as rigorous
 from .scalar_theory import scalar_waves
 from .settings import Settings
 from .surface.gratings import COHERENCE_LENGTHS, PATCHES, PROFILES
@@ -256,7 +256,7 @@ class Recipe:
 
     def digest(self) -> str:
         """Return the SHA-256 of everything that determines the spectrum: the recipe and the contents of the scan."""
-        versions = [FORMAT_VERSION, _BUILD_VERSION]
+        versions = [SCALAR_FORMAT_VERSION, _BUILD_VERSION]
         if self.settings.theory == "rigorous":
             versions.append(rigorous.BUILD_VERSION)
         content = hashlib.sha256(".".join(map(str, versions)).encode())

@@ -18,12 +18,12 @@ from mitsuba_diffraction.evaluation.validation import transmission_grating
 from mitsuba_diffraction.evaluation.validation.measured_gratings import (
     FITS,
     LINES_PER_MM,
-    THEORIES,
     littrow,
     measured,
     rms_difference,
 )
 from mitsuba_diffraction.files import whole_file
+from mitsuba_diffraction.settings import THEORIES
 
 
 def _fit(difference: Callable[[float], float], low: float, high: float, accuracy: float) -> float:

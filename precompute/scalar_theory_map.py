@@ -20,7 +20,13 @@ from rich.progress import track
 
 from mitsuba_diffraction import gratings, rigorous
 from mitsuba_diffraction.files import whole_file
-from mitsuba_diffraction.scalar_theory import MAP, difference, scalar_orders, sinusoid_powers, transmitted_orders
+from mitsuba_diffraction.scalar_theory import (
+    MAP,
+    efficiency_difference,
+    scalar_orders,
+    sinusoid_powers,
+    transmitted_orders,
+)
 
 # In wavelengths. Multiples of λ and of λ/n are avoided: at a Rayleigh anomaly the error has a narrow peak.
 PERIODS = (0.97, 1.45, 2.05, 2.7, 3.5, 4.7, 6.7, 9.4, 13.7, 20.3)
@@ -55,7 +61,7 @@ def solved(job: tuple[str, tuple[int, int], float, float]) -> tuple[float, float
         wanted, exact = found.orders, found.unpolarised
     if not np.array_equal(wanted, scalar.m):
         raise RuntimeError(f"{job}: got the orders {scalar.m}, wanted {wanted}")
-    return difference(scalar.unpolarised, exact), found.error
+    return efficiency_difference(scalar.unpolarised, exact), found.error
 
 
 def make(path: Path) -> None:

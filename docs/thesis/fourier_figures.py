@@ -18,7 +18,7 @@ from scipy.special import diric, gammaln
 
 from mitsuba_diffraction.evaluation.plots import figure, save_png
 from mitsuba_diffraction.evaluation.realtime_shader.flss import FLSS
-from mitsuba_diffraction.evaluation.realtime_shader.taylor_textures import MAX_KAPPA, taylor_transforms
+from mitsuba_diffraction.evaluation.realtime_shader.taylor_textures import MAX_TEXTURE_KAPPA, taylor_transforms
 from mitsuba_diffraction.surface.heightfield import HeightField
 
 if TYPE_CHECKING:
@@ -180,7 +180,7 @@ def plot_fourier_images(terms: int = FLSS.published_terms) -> Figure:
         row[1].set_ylabel("q$_y$ · µm")
         n = np.arange(1, terms)
         # At the shortest wavelength and normal incidence.
-        factor = np.exp(n * np.log(MAX_KAPPA) - gammaln(n + 1))
+        factor = np.exp(n * np.log(MAX_TEXTURE_KAPPA) - gammaln(n + 1))
         largest = 0.0
         for (label, values), colour in zip(extrema(texels, height).items(), ("C0", "C1", "C2"), strict=True):
             positive = np.where(values > 0, values, np.nan)[1:]

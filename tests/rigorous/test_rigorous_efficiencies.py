@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from mitsuba_diffraction import HeightField, gratings, rigorous
-from mitsuba_diffraction.evaluation.validation.coupled_waves import PROFILES, cases
+from mitsuba_diffraction.evaluation.validation.coupled_waves import SOLVED_PROFILES, cases
 from mitsuba_diffraction.scalar_theory import fresnel, profile_powers, scalar_error, scalar_orders
 
 SCATMECH = json.loads((Path(__file__).parents[1] / "data" / "scatmech.json").read_text(encoding="utf-8"))
@@ -54,7 +54,7 @@ MEENT = [
 @pytest.mark.parametrize("case", MEENT, ids=lambda case: f"{case.profile}, {case.material}, {case}")
 def test_in_plane_incidence_agrees_with_meent(case):
     found = rigorous.efficiencies(
-        PROFILES[case.profile](case.period, case.depth), light(case.angle), case.wavelength, int_ior=case.index
+        SOLVED_PROFILES[case.profile](case.period, case.depth), light(case.angle), case.wavelength, int_ior=case.index
     )
     np.testing.assert_array_equal(found.orders, case.orders)
     assert difference(found.s, case.te) < 1.5e-3

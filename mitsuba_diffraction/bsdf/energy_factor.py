@@ -13,8 +13,8 @@ import mitsuba as mi
 import numpy as np
 
 from ..energy.table import MAX_E, EnergyTable
-from .geometry import cell_of, on_square
-from .tables import NumberTable, integer_part, larger, limited, opaque, smaller
+from .device_tables import NumberTable, integer_part, larger, limited, opaque, smaller
+from .directions import cell_of, on_square
 
 
 @dataclass

@@ -15,8 +15,8 @@ from numpy.typing import NDArray
 
 from ...errors import RequestError
 from ...progress import Progress, no_progress
+from ..realtime_shader.diffraction_shader import parameters_of_variant
 from ..realtime_shader.evaluate import VARIANTS
-from ..realtime_shader.integrator import settings_of
 from .difference import Difference, difference, noise, time_of_error, white_luminance
 from .pictures import Picture, Pictures
 from .quirk_shares import QuirkShares, quirk_shares
@@ -148,7 +148,7 @@ def compare(
     settings = {"terms": terms, "window": window, "interpolation": interpolation}
     settings = {name: value for name, value in settings.items() if value is not None}
     for name in settings:
-        if not any(name in settings_of(kind) for kind in (shader, *others)):
+        if not any(name in parameters_of_variant(kind) for kind in (shader, *others)):
             raise RequestError(f"{name}: got {settings[name]!r}, which {', '.join((shader, *others))} cannot use")
     open_scene = functools.partial(
         Pictures,

@@ -14,7 +14,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from ..errors import RequestError, check_whole
 from ..progress import Progress, silent
-from ..rigorous.efficiencies import one_thread
+from ..rigorous.solver import one_thread
 from ..settings import MIN_WAVELENGTH
 from .far_field import Array, FarField, lobes_in_bins, nearest_levels
 from .plate import Plate

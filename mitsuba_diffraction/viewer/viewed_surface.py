@@ -37,7 +37,7 @@ DISCS = ("compact_disc", "dvd")
 
 
 @dataclass(frozen=True)
-class Material:
+class ViewedMaterial:
     """What the grating is made of, as in a scene.
 
     Attributes:
@@ -87,7 +87,7 @@ class Surface:
     spectrum: GratingSpectrum
     recipe: Recipe | None
     grating: Mapping[str, str | int | float]
-    material: Material
+    material: ViewedMaterial
     command: str = ""
 
     def __post_init__(self) -> None:
@@ -210,13 +210,13 @@ def _with_plastic(recipe: Recipe, parameters: Mapping[str, Any], covered: bool) 
     return own | dict(parameters)
 
 
-def material_from(parameters: Mapping[str, Any], others: tuple[str, ...] = ()) -> Material:
+def material_from(parameters: Mapping[str, Any], others: tuple[str, ...] = ()) -> ViewedMaterial:
     """Return the material from the parameters of a scene; `others` are names for the message.
 
     Raises:
         RequestError: if one is wrong, or not shown in a page.
     """
-    known = {field.name for field in fields(Material)}
+    known = {field.name for field in fields(ViewedMaterial)}
     for name, value in parameters.items():
         if name in _NOT_SHOWN:
             raise RequestError(f"{name}: got {value!r}, and the page shows {_NOT_SHOWN[name]}")
@@ -225,4 +225,4 @@ def material_from(parameters: Mapping[str, Any], others: tuple[str, ...] = ()) -
             raise RequestError(f"{name}: got {value!r}, wanted a parameter among {wanted}")
     if "material" in parameters and "int_ior" in parameters:
         raise RequestError("material: a conductor or a perfect mirror takes no int_ior; give one or the other")
-    return replace(Material(), **parameters)
+    return replace(ViewedMaterial(), **parameters)

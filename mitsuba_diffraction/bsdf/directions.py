@@ -24,8 +24,8 @@ import drjit as dr
 import mitsuba as mi
 
 from .. import geometry
+from .device_tables import integer_part, larger, limited, smaller
 from .indices import Dispersion
-from .tables import integer_part, larger, limited, smaller
 
 
 # Not frozen: Dr.Jit rebuilds what enters a branch field by field.

@@ -29,7 +29,7 @@ from .speed import Rays, seconds
 
 TOLERANCES = (1e-2, 1e-3)
 
-COLUMNS = {
+RESULT_COLUMNS = {
     "surface": "{.surface}",
     "toler-\nance": "{.tolerance:g}",
     "inter-\nvals": "{.intervals}",
@@ -85,7 +85,7 @@ class Result:
         return self.evaluations / 1e6
 
 
-def run(
+def run_benchmark(
     cases: Iterable[Case],
     *,
     tolerances: Sequence[float] = TOLERANCES,
@@ -160,16 +160,20 @@ def _measured(
     )
 
 
-def tables(results: Sequence[Result], shaders: Sequence[ShaderSpeed], sampled: Sequence[Sampling]) -> list[Table]:
+def benchmark_tables(
+    results: Sequence[Result], shaders: Sequence[ShaderSpeed], sampled: Sequence[Sampling]
+) -> list[Table]:
     """Return tables of speed and error, of the real-time shaders and of sampling, for a terminal."""
     return [
-        table(COLUMNS, (report.cells(COLUMNS, result) for result in results)),
-        table(shader_speed.COLUMNS, (report.cells(shader_speed.COLUMNS, row) for row in shaders), texts=2),
-        table(sampling.COLUMNS, (report.cells(sampling.COLUMNS, row) for row in sampled)),
+        table(RESULT_COLUMNS, (report.cells(RESULT_COLUMNS, result) for result in results)),
+        table(
+            shader_speed.SHADER_COLUMNS, (report.cells(shader_speed.SHADER_COLUMNS, row) for row in shaders), texts=2
+        ),
+        table(sampling.SAMPLING_COLUMNS, (report.cells(sampling.SAMPLING_COLUMNS, row) for row in sampled)),
     ]
 
 
-def save_plot(results: Sequence[Result], path: str | os.PathLike[str]) -> None:
+def save_speed_plot(results: Sequence[Result], path: str | os.PathLike[str]) -> None:
     """Plot error against speed, a line for each surface: right is faster, down is more accurate."""
     from matplotlib.figure import Figure
     from matplotlib.ticker import FuncFormatter, LogLocator, NullFormatter

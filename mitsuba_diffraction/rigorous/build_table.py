@@ -25,8 +25,26 @@ from ..materials import index_of, refractive_index
 from ..progress import Progress, silent, stage
 from ..settings import Settings
 from ..surface.heightfield import HeightField
-from .coordinate_transformation import ABOVE, BELOW, Curve, Grating, HalfSpace, Scattered, curve_of, half_space, scatter
-from .efficiencies import (
+from .coordinate_transformation import (
+    ABOVE,
+    BELOW,
+    Curve,
+    CurveMatrices,
+    HalfSpace,
+    Scattered,
+    curve_of,
+    half_space,
+    scatter,
+)
+from .rigorous_spectrum import (
+    MAX_PERIOD_IN_WAVELENGTHS,
+    Axes,
+    RigorousSpectrum,
+    fractions_at_nodes,
+    interval_bounds,
+    rank,
+)
+from .solver import (
     ODD,
     REVERSED,
     converge,
@@ -37,7 +55,6 @@ from .efficiencies import (
     unpolarised,
     wave_numbers,
 )
-from .spectrum import MAX_PERIOD_IN_WAVELENGTHS, Axes, RigorousSpectrum, fractions_at_nodes, interval_bounds, rank
 
 Real = NDArray[np.float64]
 # n of the incident and of the outgoing orders, and their matrices, (outgoing orders, incident orders, 4, 4).
@@ -74,7 +91,7 @@ MAX_POLARISATION_ERROR = 3.0
 """Bound of `polarisation_error`, in tolerances: matrices vary faster than η."""
 
 
-def build_spectrum(
+def build_rigorous(
     height_field: HeightField,
     settings: Settings,
     progress: Progress = silent,
@@ -158,7 +175,7 @@ class _Surface:
         curve = curve_of(height_field)
         self.harmonics = max(self._harmonics(curve, np.array(d) / np.linalg.norm(d)) for d in _HARMONICS_DIRECTIONS)
         # The table uses the first. The others serve light that needs more harmonics, and the checks.
-        self.gratings = [Grating(curve, int(1.4**k * self.harmonics)) for k in range(5)]
+        self.gratings = [CurveMatrices(curve, int(1.4**k * self.harmonics)) for k in range(5)]
         medium = settings.int_ior if settings.material is None else index_of("material", settings.material).digest
         request = height_field.digest, self.wavelengths, medium, settings.ext_ior, settings.polarised, self.transmission
         self.digest = hashlib.sha256(repr((request, self.harmonics, BUILD_VERSION)).encode()).hexdigest()
@@ -199,7 +216,7 @@ class _Surface:
         square: float,
         lights: Iterable[tuple[float, complex]],
         finer: int = 0,
-        fields: Callable[[Grating, float, complex, bool], HalfSpace] = half_space,
+        fields: Callable[[CurveMatrices, float, complex, bool], HalfSpace] = half_space,
     ) -> list[Scattered]:
         """Solve for light of all orders from above and below, for each (ν², γ'²).
 

@@ -20,14 +20,14 @@ from numpy.typing import ArrayLike, NDArray
 
 from ..errors import RequestError
 from ..settings import TRANSMISSIONS, lobe_cutoff, lobe_width
-from ..spectrum.exr import doubles, one_line, read, write
+from ..spectrum.exr import doubles, one_line, read_channels, write_channels
 from ..spectrum.grids import OrderGrid
-from .efficiencies import ODD, REVERSED
+from .solver import ODD, REVERSED
 
 Real = NDArray[np.float64]
 
-FORMAT = "mitsuba_diffraction rigorous spectrum"
-FORMAT_VERSION = 5
+RIGOROUS_FORMAT = "mitsuba_diffraction rigorous spectrum"
+RIGOROUS_FORMAT_VERSION = 5
 
 # Attributes and their names in files.
 _NUMBERS = {
@@ -456,13 +456,13 @@ class RigorousSpectrum:
             **{key: getattr(self, name) for name, key in _TEXTS.items()},
             "units": "lengths and wavelengths in micrometres",
         }
-        write(path, FORMAT, FORMAT_VERSION, header, arrays, recipe)
+        write_channels(path, RIGOROUS_FORMAT, RIGOROUS_FORMAT_VERSION, header, arrays, recipe)
 
     @classmethod
     def load(cls, path: str | os.PathLike[str], recipe: str | None = None) -> RigorousSpectrum:
         """Read a spectrum that `save` wrote; arguments and errors of `GratingSpectrum.load`."""
         path = Path(path)
-        header, channels = read(path, FORMAT, FORMAT_VERSION, recipe)
+        header, channels = read_channels(path, RIGOROUS_FORMAT, RIGOROUS_FORMAT_VERSION, recipe)
         try:
             (period,), (shortest, longest), (index,) = header["period"], header["wavelengths"], header["index"]
             steps = tuple(header[name] for name in _STEPS)

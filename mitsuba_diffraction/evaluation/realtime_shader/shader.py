@@ -11,14 +11,21 @@ import mitsuba as mi
 import numpy as np
 from numpy.typing import ArrayLike
 
-from ...bsdf.tables import larger, opaque
+from ...bsdf.device_tables import larger, opaque
 from ...geometry import k_g
 from ...settings import SUN_COHERENCE_LENGTH, lobe_width
 from ...surface.heightfield import HeightField
 from .quirks import Quirks
 from .taper import tapered
-from .taylor_textures import MAX_KAPPA, TaylorTextures, taylor_transforms, terms_for
-from .tristimulus import MIN_WAVELENGTH, PUBLISHED_R0, WAVELENGTH_COUNT, WAVELENGTH_STEP, SpectralWeights, rgb_matrix
+from .taylor_textures import MAX_TEXTURE_KAPPA, TaylorTextures, taylor_transforms, terms_for
+from .tristimulus import (
+    FIRST_WAVELENGTH,
+    PUBLISHED_R0,
+    WAVELENGTH_COUNT,
+    WAVELENGTH_STEP,
+    SpectralWeights,
+    rgb_matrix,
+)
 
 if TYPE_CHECKING:
     from typing_extensions import Self
@@ -234,7 +241,7 @@ class TextureShader(Shader):
             return self._terms
         if self.quirks.fixed_terms:
             return self.published_terms
-        return terms_for(MAX_KAPPA * self._height_field.half_range * self._max_height_scale, SERIES_ERROR)
+        return terms_for(MAX_TEXTURE_KAPPA * self._height_field.half_range * self._max_height_scale, SERIES_ERROR)
 
     @property
     def sigma(self) -> float:
@@ -300,7 +307,7 @@ def trapezoid(
     result = mi.Color3f(0)
     index = mi.UInt32(0)
     while active & (index < WAVELENGTH_COUNT):
-        wavelength = MIN_WAVELENGTH + WAVELENGTH_STEP * mi.Float(index)
+        wavelength = FIRST_WAVELENGTH + WAVELENGTH_STEP * mi.Float(index)
         weight, r_0 = weights(wavelength, active)
         at_end = (index == 0) | (index == WAVELENGTH_COUNT - 1)
         width = dr.select(at_end, 0.5 * WAVELENGTH_STEP, WAVELENGTH_STEP) * shader.fresnel(r_0, gain)

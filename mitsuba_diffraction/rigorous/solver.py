@@ -16,7 +16,7 @@ from threadpoolctl import ThreadpoolController
 from ..errors import RequestError
 from ..materials import refractive_index
 from ..surface.heightfield import HeightField
-from .coordinate_transformation import ABOVE, BELOW, Curve, Grating, Scattered, curve_of, half_space, scatter
+from .coordinate_transformation import ABOVE, BELOW, Curve, CurveMatrices, Scattered, curve_of, half_space, scatter
 
 Real = NDArray[np.float64]
 Complex = NDArray[np.complex128]
@@ -274,7 +274,7 @@ def solve(curve: Curve, omega: Real, k_0: float, index: complex, harmonics: int)
 @one_thread()
 def scattered(curve: Curve, omega: Real, k_0: float, index: complex, harmonics: int) -> Scattered:
     """Solve for light of the tangential wave vector of ω_i and of all orders that it is diffracted into."""
-    grating = Grating(curve, harmonics)
+    grating = CurveMatrices(curve, harmonics)
     alpha, k_y = -omega[:2] * k_0 * (1 if omega[2] > 0 else index.real)
     above = half_space(grating, alpha, k_0**2 - k_y**2, True)
     square = k_0**2 * (index.real**2 if index.imag == 0 else index**2) - k_y**2

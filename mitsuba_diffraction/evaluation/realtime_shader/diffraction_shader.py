@@ -10,17 +10,17 @@ import mitsuba as mi
 import numpy as np
 from numpy.typing import NDArray
 
+from ...bsdf.device_tables import opaque
 from ...bsdf.fresnel import Dielectric
 from ...bsdf.layers import Layers
-from ...bsdf.tables import opaque
 from ...errors import RequestError
 from ...manual import Parameter, listed
-from .base import Shader
 from .evaluate import VARIANTS
-from .lights import Light, lights_of, spectrum_of
+from .lights import Light, lights_of, sampled_spectrum
 from .pq import PQ
 from .quirks import Quirks
-from .surfaces import Shaded, gratings_of, in_place, recipe_of, sum_along
+from .shader import Shader
+from .surfaces import Shaded, gratings_of, in_place, recipe_of_layers, sum_along
 from .tristimulus import Emission
 
 PUBLISHED_BRIGHTNESS = 1000.0
@@ -75,7 +75,7 @@ def define() -> type:
                 raise RequestError(f"variant: got {self.variant!r}, wanted one of {', '.join(VARIANTS)}")
             quirks = Quirks.as_published() if _boolean(props, "as_published", True) else Quirks.corrected()
             self.quirks = replace(quirks, **{name: props[name] for name in Quirks.names() if name in props})
-            self.settings = {name: props[name] for name in settings_of(self.variant) if name in props}
+            self.settings = {name: props[name] for name in parameters_of_variant(self.variant) if name in props}
             self.shadows = _boolean(props, "shadows", False)
             self.diffuse_weight = props.get("diffuse_weight", 0.5)
             if not (isinstance(self.diffuse_weight, int | float) and 0 <= self.diffuse_weight <= 1):
@@ -116,7 +116,7 @@ def define() -> type:
             for known, shader in self._shaders:
                 if known is layers:
                     return shader
-            recipe = recipe_of(layers)
+            recipe = recipe_of_layers(layers)
             settings = dict(self.settings, shadowing=layers.grating.theory.shadowing)
             if self.variant != "gem":
                 settings["corrected_coherence_length"] = float(recipe.settings.coherence_length)
@@ -217,7 +217,7 @@ def checked_brightness(value: object) -> float:
     return float(value) or PUBLISHED_BRIGHTNESS
 
 
-def settings_of(variant: str) -> tuple[str, ...]:
+def parameters_of_variant(variant: str) -> tuple[str, ...]:
     """Return the parameters specific to a variant of the shader."""
     if variant == "gem":
         return "spacing", "roughness"
@@ -226,4 +226,4 @@ def settings_of(variant: str) -> tuple[str, ...]:
 
 def _normal_reflectance(layers: Layers) -> NDArray[np.float64]:
     """Return R at normal incidence at `tristimulus.wavelengths`, (401,)."""
-    return spectrum_of(lambda si: layers.grating.theory.material(si, mi.Float(1), mi.Bool(True)))
+    return sampled_spectrum(lambda si: layers.grating.theory.material(si, mi.Float(1), mi.Bool(True)))

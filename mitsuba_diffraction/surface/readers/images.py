@@ -18,7 +18,7 @@ from PIL import Image, UnidentifiedImageError
 
 from ...errors import RequestError
 from ...outputs import MARK
-from .scan import DAMAGED, MAX_BYTES, Scan
+from .scan import DAMAGED, MAX_ARRAY_BYTES, Scan
 
 
 def read_npy(path: Path) -> Scan:
@@ -32,8 +32,8 @@ def read_npz(path: Path) -> Scan:
     try:
         with zipfile.ZipFile(path) as archive:
             unpacked = max((member.file_size for member in archive.infolist()), default=0)
-            if unpacked > MAX_BYTES:
-                raise RequestError(f"got an array of {unpacked} bytes, wanted at most {MAX_BYTES}")
+            if unpacked > MAX_ARRAY_BYTES:
+                raise RequestError(f"got an array of {unpacked} bytes, wanted at most {MAX_ARRAY_BYTES}")
             names = [name.removesuffix(".npy") for name in archive.namelist()]
             if "heights" not in names:
                 raise RequestError(f"got the arrays {names}, wanted 'heights' and optionally 'pixel_size'")
@@ -73,13 +73,13 @@ MAX_ANNOTATION_FRACTION = 0.25  # of pixels that are coloured, such as a scale b
 def private_tag(path: Path, tags: Iterable[int]) -> int | None:
     """Return which of these tags a TIFF has, None if it has none of them."""
     with warnings.catch_warnings(), suppress(*DAMAGED, ValueError, OSError, Image.DecompressionBombError):
-        warnings.simplefilter("ignore")  # `read` refuses what is too large
+        warnings.simplefilter("ignore")  # `read_image` refuses what is too large
         with Image.open(path, formats=("TIFF",)) as picture:
             return next((tag for tag in tags if tag in picture.tag_v2), None)
     return None
 
 
-def read(path: Path) -> Scan:
+def read_image(path: Path) -> Scan:
     """Read the channel of an image."""
     with warnings.catch_warnings():
         # Warnings of Pillow (decompression bombs, damaged metadata) are errors here.

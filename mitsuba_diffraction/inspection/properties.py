@@ -18,7 +18,7 @@ from ..spectrum.sample import effective_coherence_length, standard_error
 from ..surface.heightfield import HeightField
 from ..surface.periods import Period, find_periods, hann
 from ..surface.prepare import white_noise
-from .colours import CHANGE, MAX_COLOUR_COHERENCE_LENGTH, Change, changes, same_period
+from .predicted_colours import CHANGE, MAX_COLOUR_COHERENCE_LENGTH, Change, changes, same_period
 
 Array = NDArray[np.float64]
 
