@@ -72,7 +72,7 @@ _OF_PROFILE = "coherence_length", "largest_height_range", *REQUESTED
 MAX_PATCHES = 1000  # of which the mean has three per cent of the speckle of one patch
 # Incremented when the same input gives a different result, to invalidate the cache.
 _BUILD_VERSION = 10
-# Spectra in the package (precompute/ready_spectra.py), named as in the cache.
+# Spectra in the package (tools/data/ready_spectra.py), named as in the cache.
 READY_SPECTRA = Path(__file__).parent / "data" / "spectra"
 _HEIGHTS_TIME_FRACTION = 0.3  # of the build, spent on the heights of several patches, roughly
 # Mitsuba constructs plugins in parallel; only one of those with the same recipe may compute its spectrum.

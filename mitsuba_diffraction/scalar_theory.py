@@ -2,7 +2,7 @@
 
 Scalar theory treats each facet of the surface as a plane mirror (tangent-plane approximation), which holds if the
 surface varies slowly on the scale of a wavelength. A stored map quantifies its error over period/λ and depth/λ, by the
-solver of `rigorous` (`precompute/scalar_theory_map.py`).
+solver of `rigorous` (`tools/data/scalar_theory_map.py`).
 """
 
 from __future__ import annotations
@@ -227,7 +227,7 @@ def efficiency_difference(scalar: ArrayLike, rigorous: ArrayLike) -> float:
 
 @functools.cache
 def error_map(material: str = "dielectric") -> tuple[Array, Array, Array, Array]:
-    """Return the error of scalar theory for sinusoids in unpolarised light (`precompute/scalar_theory_map.py`).
+    """Return the error of scalar theory for sinusoids in unpolarised light (`tools/data/scalar_theory_map.py`).
 
     Args:
         material: "dielectric", n = 1.5, or "Al", aluminium at 550 nm; "transmitted" and "transmitted from below": the

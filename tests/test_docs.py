@@ -39,7 +39,7 @@ SHOWN = {"text", "bash"}
 BY_OTHER_MEANS = (
     *("python3 -m venv", "python -m pytest", "pip install", "jupyter ", "mkdocs "),
     *("mitsuba-diffraction benchmark", "mitsuba-diffraction convergence", "mitsuba-diffraction validate"),
-    *("python precompute/rigorous_reference.py", "python scenes/", "python docs/"),
+    *("python tools/", "python scenes/"),
 )
 """Commands that CI runs, and the tests of notebooks, the manual, the benchmark, the validation and the gallery."""
 NUMBER = re.compile(r"(?<![\w.])[-−]?\d+(?:\.\d*)?(?:e[-+]?\d+)?")

@@ -221,7 +221,7 @@ def test_plugins_are_registered_whenever_the_package_is_imported(lines):
 
 
 REPOSITORY = PACKAGE.parent
-SCRIPTS = sorted(path for folder in ("docs", "precompute", "scenes") for path in (REPOSITORY / folder).rglob("*.py"))
+SCRIPTS = sorted(path for folder in ("tools", "scenes") for path in (REPOSITORY / folder).rglob("*.py"))
 PAGES = [REPOSITORY / "README.md", *sorted((REPOSITORY / "docs").rglob("*.md")), *REPOSITORY.glob("notebooks/*.ipynb")]
 
 

@@ -1,7 +1,6 @@
 """Ruled gratings as their maker measured them."""
 
 import importlib
-from pathlib import Path
 
 import measured_figures
 import numpy as np
@@ -61,7 +60,6 @@ def test_measured_gratings_are_plotted_with_both_theories(llvm):
 
 @pytest.mark.slow
 def test_rigorous_theory_fits_measurements_that_scalar_theory_does_not(monkeypatch):
-    monkeypatch.syspath_prepend(Path(__file__).parents[2] / "precompute")
     ruled_fits = importlib.import_module("ruled_fits")
     for theory in THEORIES:
         stored = measured_gratings.stored_angles()["R831"][theory]

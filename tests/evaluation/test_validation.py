@@ -17,7 +17,7 @@ from mitsuba_diffraction.evaluation.record import Check, Record
 from mitsuba_diffraction.evaluation.validation import analytic, conservation, coupled_waves
 from mitsuba_diffraction.evaluation.validation.checks import checks, scalar_range, surface_checks
 
-PRECOMPUTE = Path(__file__).parents[2] / "precompute"
+TOOLS = Path(__file__).parents[2] / "tools" / "data"
 CHECKS = checks()
 
 
@@ -292,9 +292,8 @@ def test_stored_results_conserve_energy_and_are_converged():
 
 
 def solver(monkeypatch, name="coupled_waves"):
-    """A module of precompute/."""
+    """A module of tools/data/."""
     pytest.importorskip("meent", reason="the extra 'reference' is not installed")
-    monkeypatch.syspath_prepend(PRECOMPUTE)
     return importlib.import_module(name)
 
 
@@ -305,7 +304,7 @@ def test_the_script_of_the_stored_results_runs(monkeypatch, tmp_path):
     assert len(jobs) == len(coupled_waves.cases()) + len(coupled_waves.stored()["map"])
     # As it does, on the two that are quickest.
     grating = next(j for j in jobs if j.get("profile") == "sinusoidal" and (j["period"], j["depth"]) == (1.75, 0.1))
-    monkeypatch.setenv("PYTHONPATH", str(PRECOMPUTE))
+    monkeypatch.setenv("PYTHONPATH", str(TOOLS))
     maker.make(tmp_path / "made.json", [grating, next(j for j in jobs if "profile" not in j)], workers=1)
     made, stored = json.loads((tmp_path / "made.json").read_text("utf-8")), coupled_waves.stored()
     assert made.keys() == stored.keys()

@@ -290,7 +290,7 @@ def test_more_harmonics_do_not_lose_digits():
 
 
 def test_a_deep_dielectric_agrees_with_meent():
-    """s light; 22 harmonics, 128 and 256 layers, extrapolated (`precompute/coupled_waves.py`)."""
+    """s light; 22 harmonics, 128 and 256 layers, extrapolated (`tools/data/coupled_waves.py`)."""
     found = rigorous.efficiencies(gratings.sinusoidal(1.3, 1.6), light(20), 0.6, int_ior=3.0)
     np.testing.assert_array_equal(found.orders, [-1, 0, 1, 2])
     assert difference(found.s, np.array([0.0254429, 0.0295994, 0.0012986, 0.0009813])) < 3e-3

@@ -121,7 +121,7 @@ def _plugin(profile: str, period: float, depth: float, material: str) -> tuple[A
 
 @functools.cache
 def stored() -> dict[str, Any]:
-    """Return the stored rigorous results, as `precompute/rigorous_reference.py` wrote them."""
+    """Return the stored rigorous results, as `tools/data/rigorous_reference.py` wrote them."""
     return json.loads(STORED.read_text(encoding="utf-8"))
 
 

@@ -84,7 +84,7 @@ def measured(name: str) -> tuple[Real, Real]:
 
 @functools.cache
 def stored_angles() -> dict[str, dict[str, float]]:
-    """Return ruled grating, or grooves of T300 → theory → fitted angle in degrees (`precompute/ruled_fits.py`)."""
+    """Return ruled grating, or grooves of T300 → theory → fitted angle in degrees (`tools/data/ruled_fits.py`)."""
     stored = json.loads(FITS.read_text(encoding="utf-8"))
     return {**stored["facet angles"], **stored["groove angles"]}
 

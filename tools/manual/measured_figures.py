@@ -1,6 +1,6 @@
 """Figures of docs/validation.md: efficiencies of gratings as measured, by scalar theory and by rigorous theory.
 
-python docs/measured_figures.py docs/measured_gratings.png docs/measured_transmission.png
+python tools/manual/measured_figures.py docs/measured_gratings.png docs/measured_transmission.png
 """
 
 from __future__ import annotations

@@ -1,8 +1,8 @@
 """Print the tables of docs/design.md: what depth, levels, texels and time bring, and other targets.
 
-    python docs/design_table.py           # all rows
-    python docs/design_table.py cat ring  # those whose names contain one of the words
-    python docs/design_table.py bound     # of other targets: what the lobes of the orders allow
+    python tools/manual/design_table.py           # all rows
+    python tools/manual/design_table.py cat ring  # those whose names contain one of the words
+    python tools/manual/design_table.py bound     # of other targets: what the lobes of the orders allow
 
 Times are of the processor, on one core.
 """
@@ -24,7 +24,7 @@ from mitsuba_diffraction.inverse_design.plate import Plate
 from mitsuba_diffraction.inverse_design.search import far_field_of
 from mitsuba_diffraction.inverse_design.target import wanted_fractions
 
-CAT = Path(__file__).parents[1] / "precompute" / "designed" / "cat.png"
+CAT = Path(__file__).parents[2] / "precompute" / "designed" / "cat.png"
 PLATES: dict[str, Mapping[str, float]] = {
     "default": {},
     "0.4 µm deep": {"height_range": 0.4},

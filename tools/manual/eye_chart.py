@@ -1,4 +1,4 @@
-"""Print how well designed plates resolve bars, and draw the chart: python docs/eye_chart.py docs/eye_chart.png
+"""Print how well designed plates resolve bars, and draw the chart: python tools/manual/eye_chart.py docs/eye_chart.png
 
 The chart has a row of three bars and equal gaps for each width, in distances λ/T of adjacent orders. It is cast by
 plates for a laser of 532 nm and for white light (orders of 550 nm). Contrast is (L − L₀)/(L + L₀) of the mean radiances

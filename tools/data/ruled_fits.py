@@ -1,4 +1,4 @@
-"""Fit facet angles to measured gratings: `python precompute/ruled_fits.py [OUT.json]`; three minutes on one core.
+"""Fit facet angles to measured gratings: `python tools/data/ruled_fits.py [OUT.json]`; three minutes on one core.
 
 `validation/measured_gratings.py` and `validation/transmission_grating.py` read them.
 """
@@ -56,7 +56,7 @@ def make(path: Path) -> None:
     """Fit each grating by both theories and write the angles atomically."""
     ruled, grooves = track(LINES_PER_MM, "facet angles"), track(transmission_grating.GROOVES, "grooves of T300")
     content = {
-        "made by": "python precompute/ruled_fits.py",
+        "made by": "python tools/data/ruled_fits.py",
         "unit": "degrees",
         "facet angles": {name: {theory: facet_angle(name, theory) for theory in THEORIES} for name in ruled},
         "groove angles": {shape: {theory: groove_angle(shape, theory) for theory in THEORIES} for shape in grooves},

@@ -1,6 +1,6 @@
 """Print the table of docs/viewer.md: the time of a frame of the live view, of this model and of the shader of 2014.
 
-    python docs/viewer_speed.py
+    python tools/manual/viewer_speed.py
 
 A sphere under parallel light, drawn by Chromium's software renderer; both shaders draw all pixels in turn.
 """

@@ -1,4 +1,4 @@
-"""Compute the stored rigorous results: `python precompute/rigorous_reference.py [OUT.json]`.
+"""Compute the stored rigorous results: `python tools/data/rigorous_reference.py [OUT.json]`.
 
 Needs the extra "reference" (meent); about ten minutes on two cores. `scalar_theory.py` and
 `validation/coupled_waves.py` read them.
@@ -126,7 +126,7 @@ def write(path: Path, results: list[dict[str, Any]]) -> None:
     cases = [result for result in results if "profile" in result]
     table = [result for result in results if "profile" not in result]
     content = {
-        "made by": "python precompute/rigorous_reference.py",
+        "made by": "python tools/data/rigorous_reference.py",
         "with": {name: metadata.version(name) for name in ("meent", "numpy", "scipy")},
         "tolerance": TOLERANCE,
         "units": "period, depth, wavelength in µm (in wavelengths in the map), angle in degrees from the normal, light "

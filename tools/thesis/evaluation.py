@@ -1,6 +1,6 @@
 """The evaluation of the thesis of 2014 (chapter 5) for the real-time shader and for this model: figures and a table.
 
-    python docs/thesis/evaluation.py FOLDER [SURFACE …]
+    python tools/thesis/evaluation.py FOLDER [SURFACE …]
 
 `docs/evaluation.md` discusses them.
 """

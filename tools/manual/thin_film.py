@@ -1,6 +1,6 @@
 """Figures of docs/plugin.md: a hologram with films, anodised titanium, and the stack of films of a jewel beetle.
 
-python docs/thin_film.py docs/thin_film.png docs/film_stack.png
+python tools/manual/thin_film.py docs/thin_film.png docs/film_stack.png
 
 Curves and colours are computed by the plugin, at the centres of lobes; points by closed forms, J_m² K with R by the
 package tmm. Lines are contours of R by tmm.

@@ -1,6 +1,6 @@
 """The live page of the manual: a hook of MkDocs (mkdocs.yml), which makes it with the site.
 
-    python docs/live_pages.py FOLDER
+    python tools/manual/live_pages.py FOLDER
 
 writes it to a folder instead.
 """
@@ -17,7 +17,7 @@ from mkdocs.structure.files import File, Files
 from mitsuba_diffraction.viewer.page import page
 from mitsuba_diffraction.viewer.viewed_surface import Surface
 
-RECIPES = Path(__file__).parents[1] / "precompute"
+RECIPES = Path(__file__).parents[2] / "precompute"
 SURFACES = {
     "compact_disc": ("Compact disc", "compact_disc.toml", {}),
     "dvd": ("DVD", "dvd.toml", {}),

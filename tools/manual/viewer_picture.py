@@ -1,9 +1,9 @@
 """Take docs/viewer.png: a live page in Chromium, as it opens.
 
-    python docs/viewer_picture.py docs/viewer.png
-    python docs/viewer_picture.py --dark --width 390 --height 844 phone.png
+    python tools/manual/viewer_picture.py docs/viewer.png
+    python tools/manual/viewer_picture.py --dark --width 390 --height 844 phone.png
 
-needs what docs/live_browser.py needs.
+needs what tools/manual/live_browser.py needs.
 """
 
 from __future__ import annotations

@@ -1,6 +1,6 @@
 """Maps of the BRDF that the author of the thesis of 2014 published, and the same maps by this project.
 
-    python docs/thesis/published_maps.py FOLDER
+    python tools/thesis/published_maps.py FOLDER
 
 Each is a picture of the outgoing hemisphere, light along the normal: (x, y) = (sin θ_o cos φ_o, sin θ_o sin φ_o). They
 were made by FLSS from an AFM scan of 65 µm, which is available, so that the emulation can be compared pixel by pixel.

@@ -1,6 +1,6 @@
 """Figures 3.1 and 4.1 of the draft of the thesis of 2014: interpolated transforms, and transforms of powers of heights.
 
-python docs/thesis/fourier_figures.py FOLDER
+python tools/thesis/fourier_figures.py FOLDER
 """
 
 from __future__ import annotations

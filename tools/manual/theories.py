@@ -1,6 +1,6 @@
 """Scalar and rigorous theory of one grating: costs, and errors relative to the solver, of 1200 lines/mm.
 
-    python docs/theories.py
+    python tools/manual/theories.py
 
 prints the table of docs/speed.md, in minutes.
 """

@@ -1,4 +1,4 @@
-"""Compute the map of errors of scalar theory: `python precompute/scalar_theory_map.py [OUT.json]`.
+"""Compute the map of errors of scalar theory: `python tools/data/scalar_theory_map.py [OUT.json]`.
 
 For sinusoids of many periods and depths, in a dielectric and in aluminium, it compares scalar efficiencies with those
 of `mitsuba_diffraction.rigorous`, of reflected and, in the dielectric, of transmitted light; eight minutes on two
@@ -71,7 +71,7 @@ def make(path: Path) -> None:
         found = list(track(pool.map(solved, jobs, chunksize=4), "rigorous efficiencies", total=len(jobs)))
     errors, changes = (np.reshape(part, (len(MATERIALS), len(DIRECTIONS), -1)) for part in zip(*found, strict=True))
     content = {
-        "made by": "python precompute/scalar_theory_map.py",
+        "made by": "python tools/data/scalar_theory_map.py",
         "units": "periods and depths in wavelengths; directions in degrees: of incidence, and of the plane of "
         "incidence from that perpendicular to the grooves; error[material][direction]: Σ|Δη| / Σ η of unpolarised "
         "light, all periods of the first depth first; change: the largest at the last raise of harmonics",

@@ -1,6 +1,6 @@
 """The author's snakes beside the modelled ones: FLSS as published under one directional light, and path tracing.
 
-python docs/thesis/published_snakes.py snakes.png
+python tools/thesis/published_snakes.py snakes.png
 """
 
 from __future__ import annotations

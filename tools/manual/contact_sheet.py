@@ -1,4 +1,4 @@
-"""Render every surface of this folder into one picture: python precompute/contact_sheet.py ready_surfaces.png
+"""Render every surface of this folder into one picture: python tools/manual/contact_sheet.py ready_surfaces.png
 
 Reflecting surfaces are on the same arch below two long lamps, discs are flat below two small ones, and films and
 transmission gratings are a pane before three. Metals have a dim sky, skins black pigment. Pictures are denoised.
@@ -24,8 +24,8 @@ from mitsuba_diffraction.render.denoise import denoised_picture
 from mitsuba_diffraction.render.scene import load_spectral_scene
 from mitsuba_diffraction.render.spectral_image import save_preview
 
-HERE = Path(__file__).parent
-sys.path.insert(0, str(HERE.parent / "scenes"))
+RECIPES = Path(__file__).parents[2] / "precompute"
+sys.path.insert(0, str(RECIPES.parent / "scenes"))
 COLUMNS = 3
 WIDTH, HEIGHT, GAP, TEXT = 400, 280, 16, 56
 """Pixels of a panel, between panels, and of the two lines below it."""
@@ -125,7 +125,7 @@ def write_arch(path: Path) -> None:
 def picture(name: str, folder: Path, spp: int) -> Image.Image:
     """Render the panel of one recipe; the mesh `arch.ply` is in the folder."""
     panel = PANELS[name]
-    content = {"recipe": (HERE / f"{name}.toml").as_posix(), "material": panel.material}
+    content = {"recipe": (RECIPES / f"{name}.toml").as_posix(), "material": panel.material}
     if panel.kind == "pane":
         lamps = "".join(SMALL.format(x, 6, z, 0.1, LAMP.format(3)) for x, z in ((-1.6, 0.9), (0, 0), (1.6, -0.9)))
         text = NIGHT.format(lamps=lamps, **content)

@@ -1,4 +1,4 @@
-"""Print the table of docs/plugin.md on the conservation of energy: `python docs/albedo_table.py [NAME …]`."""
+"""Print the table of docs/plugin.md on the conservation of energy: `python tools/manual/albedo_table.py [NAME …]`."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from mitsuba_diffraction import testing
 
 import mitsuba as mi  # isort: skip
 
-RECIPES = sorted((Path(__file__).parents[1] / "precompute").glob("*.toml"))
+RECIPES = sorted((Path(__file__).parents[2] / "precompute").glob("*.toml"))
 SQUARE = {"period": 2.5, "depth": 0.25}
 PROFILES: dict[str, dict[str, Any]] = {
     "morpho_ridges": {},

@@ -1,4 +1,4 @@
-"""Make the figure and the table of measured/README.md: python precompute/measured_skins.py docs/removed_dust.png
+"""Make the figure and the table of measured/README.md: python tools/manual/measured_skins.py docs/removed_dust.png
 
 The figure shows the pixels that the recipes of the scans of 65 µm remove. For the two height scales of Xenopeltis, the
 panel of 20 µm is located in its scan of 65 µm by normalised cross-correlation; then properties of the skin follow for
@@ -22,7 +22,7 @@ from mitsuba_diffraction.surface import prepare
 from mitsuba_diffraction.surface.heightfield import HeightField
 from mitsuba_diffraction.surface.readers import read_height_field
 
-HERE = Path(__file__).parent
+RECIPES = Path(__file__).parents[2] / "precompute"
 SCALES = 0.4435, 0.8187  # µm, black to white
 SURROUNDINGS = 1.6  # µm; slower waves are left out
 
@@ -33,7 +33,7 @@ def draw_removed(path: Path, side: int = 560) -> None:
     """Draw both scans, each `side` pixels wide, with the removed pixels in red."""
     panels = []
     for name in ("elaphe", "xenopeltis"):
-        recipe = Recipe.load(HERE / f"{name}.toml")
+        recipe = Recipe.load(RECIPES / f"{name}.toml")
         surface = recipe.surface
         scan = read_height_field(recipe.files[0], surface["pixel_size"], surface["height_range"])
         gaps = prepare.apply_steps(scan, surface["prepare"][:1]).gaps
@@ -64,10 +64,10 @@ def locate(panel: Array, scan: Array) -> tuple[float, tuple[int, int], float]:
 
 def register() -> None:
     """Print where the panel lies in the scan, and how its heights compare."""
-    recipe = Recipe.load(HERE / "xenopeltis.toml")
+    recipe = Recipe.load(RECIPES / "xenopeltis.toml")
     pixel = recipe.surface["pixel_size"]
     scan = read_height_field(recipe.files[0], pixel_size=pixel, height_range=SCALES[0]).heights
-    panel = read_height_field(HERE / "measured" / "xenopeltis_afm_20um.npz", fill_missing=True)
+    panel = read_height_field(RECIPES / "measured" / "xenopeltis_afm_20um.npz", fill_missing=True)
     zoomed = ndimage.zoom(panel.heights, panel.pixel_size[0] / pixel)
     edge = round(SURROUNDINGS / pixel)  # where the surroundings are cut off
     inside = structure(zoomed, pixel)[edge:-edge, edge:-edge]
@@ -80,7 +80,7 @@ def register() -> None:
 
 def properties(scale: float) -> list[str]:
     """Return the properties of the scan for one height scale, as they are printed."""
-    recipe = Recipe.load(HERE / "xenopeltis.toml")
+    recipe = Recipe.load(RECIPES / "xenopeltis.toml")
     field = recipe.height_field()
     heights = structure(field.heights, field.pixel_size[0]) * scale / recipe.surface["height_range"]
     low, high = np.percentile(heights, [1, 99])

@@ -1,7 +1,7 @@
 """Renew figures of the manual, each by its command.
 
-    python docs/figures.py                    # all names, with their times
-    python docs/figures.py terms gallery/window
+    python tools/manual/figures.py                    # all names, with their times
+    python tools/manual/figures.py terms gallery/window
 
 A command writes to a temporary folder, {out}; its figures then replace those in docs/. The commands of the gallery are
 on its page.
@@ -23,8 +23,8 @@ from pathlib import Path
 
 import nbformat
 
-DOCS = Path(__file__).parent
-ROOT = DOCS.parent
+ROOT = Path(__file__).parents[2]
+DOCS = ROOT / "docs"
 sys.path.insert(0, str(ROOT / "scenes"))
 PROGRAMS = {"python": [sys.executable], "mitsuba-diffraction": [sys.executable, "-m", "mitsuba_diffraction"]}
 
@@ -90,7 +90,7 @@ FIGURES = (
         5,
     ),
     Figure(("design.png",), "mitsuba-diffraction design precompute/designed/cat.png -o {out}/design.gsf"),
-    Figure(("eye_chart.png",), "python docs/eye_chart.py {out}/eye_chart.png"),
+    Figure(("eye_chart.png",), "python tools/manual/eye_chart.py {out}/eye_chart.png"),
     Figure(
         ("efficiencies.png",),
         """mitsuba-diffraction efficiency ruled,lines_per_mm=1200 --theory rigorous --material Al --angle 17.5 \
@@ -99,15 +99,15 @@ FIGURES = (
     Figure(("inspect.png",), "mitsuba-diffraction inspect precompute/elaphe.toml -o {out}/inspect.png"),
     Figure(
         ("measured_gratings.png", "measured_transmission.png"),
-        "python docs/measured_figures.py {out}/measured_gratings.png {out}/measured_transmission.png",
+        "python tools/manual/measured_figures.py {out}/measured_gratings.png {out}/measured_transmission.png",
     ),
     notebook("patch_length.png", "02_brdf_and_grating_equation", "cell-16", 6),
     picture_error("blaze", "bulb"),
     picture_error("blaze", "parallel"),
     picture_error("xenopeltis_sphere", "bulb", "-D skin=xenopeltis_tile"),
     picture_error("xenopeltis_sphere", "parallel", "-D skin=xenopeltis_tile"),
-    Figure(("ready_surfaces.jpg",), "python precompute/contact_sheet.py {out}/ready_surfaces.png", 3),
-    Figure(("removed_dust.png",), "python precompute/measured_skins.py {out}/removed_dust.png"),
+    Figure(("ready_surfaces.jpg",), "python tools/manual/contact_sheet.py {out}/ready_surfaces.png", 3),
+    Figure(("removed_dust.png",), "python tools/manual/measured_skins.py {out}/removed_dust.png"),
     notebook("scalar_theory.png", "05_can_i_trust_the_picture", "cell-07", 3),
     Figure(
         ("screen.png",),
@@ -123,16 +123,22 @@ FIGURES = (
         12,
     ),
     Figure(("terms.png",), "mitsuba-diffraction benchmark --terms --plot {out}/terms.png", 10),
-    Figure(("published_snakes.png",), "python docs/thesis/published_snakes.py {out}/published_snakes.png", 3),
-    Figure(("thin_film.png", "film_stack.png"), "python docs/thin_film.py {out}/thin_film.png {out}/film_stack.png"),
-    Figure(("fourier_images.png", "interpolation.png"), "python docs/thesis/fourier_figures.py {out}"),
-    Figure(("published_heights.png", "published_maps.png"), "python docs/thesis/published_maps.py {out}", 8),
+    Figure(("published_snakes.png",), "python tools/thesis/published_snakes.py {out}/published_snakes.png", 3),
+    Figure(
+        ("thin_film.png", "film_stack.png"), "python tools/manual/thin_film.py {out}/thin_film.png {out}/film_stack.png"
+    ),
+    Figure(("fourier_images.png", "interpolation.png"), "python tools/thesis/fourier_figures.py {out}"),
+    Figure(("published_heights.png", "published_maps.png"), "python tools/thesis/published_maps.py {out}", 8),
     Figure(
         ("brdf_xenopeltis.png", "viewing_angle_elaphe_scan.png", "viewing_angle_xenopeltis_scan.png"),
-        "python docs/thesis/evaluation.py {out} xenopeltis elaphe_scan xenopeltis_scan",
+        "python tools/thesis/evaluation.py {out} xenopeltis elaphe_scan xenopeltis_scan",
         10,
     ),
-    Figure(("viewer.png",), "python docs/viewer_picture.py {out}/viewer.png", needs="Chromium (docs/live_browser.py)"),
+    Figure(
+        ("viewer.png",),
+        "python tools/manual/viewer_picture.py {out}/viewer.png",
+        needs="Chromium (tools/manual/live_browser.py)",
+    ),
 )
 
 

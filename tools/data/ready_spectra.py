@@ -1,4 +1,4 @@
-"""Compute the spectra of skins that come with the package: python precompute/ready_spectra.py
+"""Compute the spectra of skins that come with the package: python tools/data/ready_spectra.py
 
 Recipes find them by their digest, as in the cache. To be repeated when a recipe or the computation changes.
 """
@@ -7,13 +7,14 @@ from pathlib import Path
 
 from mitsuba_diffraction.recipe import READY_SPECTRA, Recipe
 
+RECIPES = Path(__file__).parents[2] / "precompute"
 NAMES = ("xenopeltis", "elaphe", "elaphe_afm")
 
 
 def main() -> None:
     """Compute the files, and remove others."""
     READY_SPECTRA.mkdir(exist_ok=True)
-    recipes = [Recipe.load(Path(__file__).with_name(f"{name}.toml")) for name in NAMES]
+    recipes = [Recipe.load(RECIPES / f"{name}.toml") for name in NAMES]
     for name, recipe in zip(NAMES, recipes, strict=True):
         path = READY_SPECTRA / f"{recipe.digest()}.exr"
         recipe.build().save(path, recipe=recipe.digest())
