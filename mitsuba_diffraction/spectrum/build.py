@@ -64,7 +64,7 @@ def build_power_spectrum(patches: Sequence[HeightField], settings: Settings, pro
         if tolerance is None:
             tolerance = _default_tolerance(height_field, len(patches), sigma)
         rho = dataclasses.replace(settings, tolerance=tolerance).lobe_cutoff
-        orders = TilePowers(patches, max_frequency, rho * sigma)
+        orders = TilePowers(patches, max_frequency, rho * sigma, not series and tolerance >= CONTINUUM_TOLERANCE)
         lobes = orders.grid.lobes(sigma, rho)
         powers = None if series else _tile_splines(orders, lobes, sigma, max_frequency, tolerance)
         if powers is None:

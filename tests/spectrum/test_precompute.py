@@ -14,6 +14,7 @@ import mitsuba_diffraction as md
 from mitsuba_diffraction import HeightField, precompute
 from mitsuba_diffraction.settings import lobe_width
 from mitsuba_diffraction.spectrum.grids import SplineGrid
+from mitsuba_diffraction.spectrum.tile import TilePowers
 
 REACHED = 2 / 0.36
 """cycles/µm: |q| ≤ 2/λ_min."""
@@ -297,6 +298,17 @@ def test_a_tile_is_read_from_a_lattice_where_its_lobes_overlap_widely(coherence_
 
 
 # ---------------------------------------------------------------- the grid, warnings and progress
+
+
+def test_single_precision_errs_by_less_than_a_millionth_of_the_power():
+    field = HeightField(np.random.default_rng(4).uniform(0, 20, (60, 64)), 0.1)
+    kappa = 4 * np.pi / 0.15
+    single = TilePowers([field], 5.0, 0.0, single=True)
+    m_x, m_y = single.grid.axes()
+    exact = md.reference.order_powers(field, kappa)[np.ix_(m_y % 60, m_x % 64)]
+    exact[:, [0, -1]] /= 2  # the Nyquist orders, of which both signs are kept
+    exact[[0, -1]] /= 2
+    assert np.abs(single(kappa) - exact).sum() < 1e-6
 
 
 def test_the_orders_are_those_that_light_reaches():
