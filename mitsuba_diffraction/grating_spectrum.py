@@ -25,7 +25,7 @@ from .energy.table import EnergyTable
 from .errors import RequestError
 from .progress import stage
 from .scalar_theory import Waves
-from .settings import REPRESENTATIONS, Settings
+from .settings import REPRESENTATIONS, ScalarSettings
 from .spectrum.exr import doubles, one_line, read_channels, write_channels
 from .spectrum.grids import OrderGrid, SplineGrid
 from .spectrum.power_spectrum import PowerSpectrum
@@ -145,7 +145,7 @@ class GratingSpectrum(PowerSpectrum):
                 series = {"terms": header["channelCount"] // 2, "heights_from": header["heightsFrom"]}
             entries: dict[str, Any] = {name: header[key] for name, key in _OTHERS.items()}
             entries |= {name: _single(header[key]) for name, key in _NUMBERS.items()}
-            settings = Settings(
+            settings = ScalarSettings(
                 extent=header["extent"],
                 wavelengths=_pair(header["wavelengths"]),
                 representation=header["representation"],

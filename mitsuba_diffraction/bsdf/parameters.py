@@ -18,7 +18,15 @@ from ..materials import RefractiveIndex, is_file
 from ..precomputation import Spectrum, load_spectrum
 from ..recipe import REQUESTED, Recipe
 from ..rigorous.rigorous_spectrum import RigorousSpectrum
-from ..settings import FROM_RADIUS, MIN_WAVELENGTH, THEORIES, TRANSMISSIONS, VISIBLE, wavelengths_inside
+from ..settings import (
+    FROM_RADIUS,
+    MIN_WAVELENGTH,
+    THEORIES,
+    TRANSMISSIONS,
+    VISIBLE,
+    RigorousSettings,
+    wavelengths_inside,
+)
 from ..surface.gratings import PROFILES
 from .base import nested_plugin
 from .coat import SAME_INDEX, Coat, coat_from
@@ -239,7 +247,7 @@ def _inside(props: mi.Properties, media: Media, scale: float, recipe: Recipe) ->
     Parameters that do not match the recipe are refused here, before a table is computed.
     """
     settings, overrides = recipe.settings, dict[str, Any]()
-    if settings.theory == "rigorous":
+    if isinstance(settings, RigorousSettings):
         refuse_scalar_only(props)
         if settings.transmission != "none":
             check_transmission(settings.transmission, media)
