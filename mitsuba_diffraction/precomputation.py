@@ -6,6 +6,7 @@ import inspect
 import os
 import warnings
 from collections.abc import Callable, Sequence
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -18,6 +19,7 @@ from .rigorous import build_table as rigorous
 from .rigorous.rigorous_spectrum import RIGOROUS_FORMAT as RIGOROUS_FORMAT
 from .rigorous.rigorous_spectrum import RigorousSpectrum
 from .rigorous.solver import one_thread
+from .scalar_theory import scalar_waves
 from .settings import SERIES, SPECTRUM_PARAMETERS, RigorousSettings, ScalarSettings, Settings
 from .spectrum import build as scalar
 from .surface.heightfield import HeightField
@@ -58,8 +60,8 @@ def precompute(
     if not all(isinstance(patch, HeightField) for patch in patches):
         raise RequestError(f"height_field: got {type(height_field).__name__}, wanted a HeightField or several")
     spectrum = build_spectrum(patches, request, progress)
-    if isinstance(spectrum, GratingSpectrum) and spectrum.excess:
-        warnings.warn(spectrum.excess, stacklevel=2)
+    for concern in spectrum.concerns:
+        warnings.warn(concern, stacklevel=2)
     return spectrum
 
 
@@ -72,8 +74,10 @@ def _with_settings(function: Callable[..., Spectrum]) -> inspect.Signature:
 precompute.__dict__["__signature__"] = _with_settings(precompute)
 
 
-def build_spectrum(patches: Sequence[HeightField], settings: Settings, progress: Progress = silent) -> Spectrum:
-    """Compute the spectrum as `precompute`, from patches and settings."""
+def build_spectrum(
+    patches: Sequence[HeightField], settings: Settings, progress: Progress = silent, *, keep_waves: bool = False
+) -> Spectrum:
+    """Compute the spectrum as `precompute`, from patches and settings; `keep_waves`: with `GratingSpectrum.waves`."""
     if not patches:
         raise RequestError("patches: got none, wanted at least one")
     if len(patches) > 1 and settings.extent != "tile":
@@ -95,13 +99,21 @@ def build_spectrum(patches: Sequence[HeightField], settings: Settings, progress:
                 "patches = 1: an average has no amplitude"
             )
         with one_thread():
-            return GratingSpectrum(**vars(scalar.build_power_spectrum(patches, settings, progress)))
+            found = GratingSpectrum(**vars(scalar.build_power_spectrum(patches, settings, progress)))
+        if not keep_waves:
+            return found
+        return replace(found, waves=scalar_waves(first, found.extent, found.wavelengths))
     assert isinstance(settings, RigorousSettings)
     if len(patches) > 1:
         raise RequestError(
             f"theory: got rigorous and {len(patches)} patches ({first.source}, …), wanted one, of one row"
         )
     return rigorous.build_rigorous(first, settings, progress, cache_folder())
+
+
+def build_versions(settings: Settings) -> list[int]:
+    """Return the versions of the code that builds a spectrum of this theory alone."""
+    return [rigorous.BUILD_VERSION] if isinstance(settings, RigorousSettings) else []
 
 
 def load_spectrum(path: str | os.PathLike[str], recipe: str | None = None) -> Spectrum:

@@ -41,19 +41,17 @@ import warnings
 import weakref
 from collections.abc import Callable, Mapping
 from contextlib import AbstractContextManager, suppress
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from functools import cached_property
 from pathlib import Path
 from typing import Any
 
 from .errors import RequestError, check_whole
 from .files import cache_folder, refuse_special
-from .grating_spectrum import SCALAR_FORMAT_VERSION, GratingSpectrum
+from .grating_spectrum import SCALAR_FORMAT_VERSION
 from .materials import is_file
-from .precomputation import Spectrum, build_spectrum, load_spectrum
+from .precomputation import Spectrum, build_spectrum, build_versions, is_rigorous, load_spectrum
 from .progress import Progress, no_progress, part, silent, stage
-from .rigorous import build_table as rigorous
-from .scalar_theory import scalar_waves
 from .settings import SPECTRUM_PARAMETERS, ScalarSettings, Settings
 from .surface.gratings import COHERENCE_LENGTHS, PATCHES, PROFILES
 from .surface.heightfield import HeightField
@@ -249,16 +247,11 @@ class Recipe:
         """Compute the spectrum; `progress` is called with (steps done, steps in all)."""
         patches = self.height_fields(part(progress, 0, _HEIGHTS_TIME_FRACTION))
         report = part(progress, _HEIGHTS_TIME_FRACTION if len(patches) > 1 else 0, 1)
-        spectrum = build_spectrum(patches, self.settings, report)
-        if isinstance(spectrum, GratingSpectrum):
-            spectrum = replace(spectrum, waves=scalar_waves(patches[0], spectrum.extent, spectrum.wavelengths))
-        return spectrum
+        return build_spectrum(patches, self.settings, report, keep_waves=True)
 
     def digest(self) -> str:
         """Return the SHA-256 of everything that determines the spectrum: the recipe and the contents of the scan."""
-        versions = [SCALAR_FORMAT_VERSION, _BUILD_VERSION]
-        if self.settings.theory == "rigorous":
-            versions.append(rigorous.BUILD_VERSION)
+        versions = [SCALAR_FORMAT_VERSION, _BUILD_VERSION, *build_versions(self.settings)]
         content = hashlib.sha256(".".join(map(str, versions)).encode())
         surface = {name: value for name, value in self.surface.items() if name != "scan"}
         for scan in self.files:
@@ -306,6 +299,13 @@ class Recipe:
                 stacklevel=1,
             )
         return spectrum
+
+
+def theory_in(path: Path) -> str:
+    """Return the theory of a recipe, or of a saved spectrum."""
+    if path.suffix.lower() == ".toml":
+        return Recipe.load(path).settings.theory
+    return "rigorous" if is_rigorous(path) else "scalar"
 
 
 def _refuse_unknown(where: str, table: Mapping[str, Any], known: frozenset[str]) -> None:

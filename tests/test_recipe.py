@@ -65,9 +65,9 @@ def builds(monkeypatch):
     """The surfaces that were computed, not read from the cache, since the test began."""
     computed = []
 
-    def spy(patches, *arguments):
+    def spy(patches, *arguments, **options):
         computed.append(patches[0].digest)
-        return build_spectrum(patches, *arguments)
+        return build_spectrum(patches, *arguments, **options)
 
     monkeypatch.setattr(recipe_module, "build_spectrum", spy)
     return computed
@@ -432,7 +432,7 @@ def test_a_damaged_entry_is_built_again(own_cache, builds, damage):
 
 
 def test_an_interrupted_build_leaves_no_entry(own_cache, monkeypatch):
-    def interrupted(*_):
+    def interrupted(*_, **__):
         raise KeyboardInterrupt
 
     monkeypatch.setattr(recipe_module, "build_spectrum", interrupted)

@@ -222,10 +222,7 @@ def surface_from(props: mi.Properties, media: Media, scale: float = 1.0) -> Spec
             raise RequestError(
                 f"spectrum: got {props['spectrum']!r}, wanted a spectrum in Python's load_dict; XML takes a filename"
             )
-        if isinstance(surface, Recipe):
-            found = surface.settings.theory
-        else:
-            found = "rigorous" if isinstance(surface, RigorousSpectrum) else "scalar"
+        found = surface.settings.theory if isinstance(surface, Recipe) else surface.theory
         if props.get("theory", found) != found:
             raise RequestError(f"theory: got {theory!r} with a spectrum of {found} theory, wanted one built for it")
         return surface
