@@ -13,7 +13,7 @@ import mitsuba_diffraction as md
 from mitsuba_diffraction import testing
 from mitsuba_diffraction.rigorous.build_table import build_rigorous
 from mitsuba_diffraction.rigorous.rigorous_spectrum import Axes, RigorousSpectrum
-from mitsuba_diffraction.settings import Settings
+from mitsuba_diffraction.settings import RigorousSettings
 
 array, direction, floats, vectors = testing.array, testing.direction, testing.floats, testing.vectors
 WAVELENGTHS = (400.0, 500.0, 600.0, 700.0)
@@ -58,8 +58,7 @@ def made_up(coherence_length=65.0):
 @functools.cache
 def coarse_glass(transmission):
     """A coarse table of light reflected and transmitted by fine grooves in glass, with Mueller matrices."""
-    settings = Settings(
-        theory="rigorous",
+    settings = RigorousSettings(
         int_ior=1.5,
         wavelengths=(400.0, 500.0),
         tolerance=0.2,

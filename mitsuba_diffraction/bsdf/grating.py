@@ -50,7 +50,7 @@ class Grating:
         # Mitsuba's own object does not outlive the construction of the plugin.
         self._props, self._request = mi.Properties(props), request
         # The grating is black at angles that the spectrum does not cover.
-        self.min_cosine = opaque(np.cos(np.deg2rad(self.spectrum.largest_angle)) * (1 - 1e-6))
+        self.min_cosine = opaque(np.cos(np.deg2rad(self.theory.largest_angle)) * (1 - 1e-6))
 
     @property
     def interface(self) -> Interface:

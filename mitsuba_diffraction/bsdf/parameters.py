@@ -18,7 +18,15 @@ from ..materials import RefractiveIndex, is_file
 from ..precomputation import Spectrum, load_spectrum
 from ..recipe import REQUESTED, Recipe
 from ..rigorous.rigorous_spectrum import RigorousSpectrum
-from ..settings import FROM_RADIUS, MIN_WAVELENGTH, THEORIES, TRANSMISSIONS, VISIBLE, wavelengths_inside
+from ..settings import (
+    FROM_RADIUS,
+    MIN_WAVELENGTH,
+    THEORIES,
+    TRANSMISSIONS,
+    VISIBLE,
+    RigorousSettings,
+    wavelengths_inside,
+)
 from ..surface.gratings import PROFILES
 from .base import nested_plugin
 from .coat import SAME_INDEX, Coat, coat_from
@@ -214,10 +222,7 @@ def surface_from(props: mi.Properties, media: Media, scale: float = 1.0) -> Spec
             raise RequestError(
                 f"spectrum: got {props['spectrum']!r}, wanted a spectrum in Python's load_dict; XML takes a filename"
             )
-        if isinstance(surface, Recipe):
-            found = surface.settings.theory
-        else:
-            found = "rigorous" if isinstance(surface, RigorousSpectrum) else "scalar"
+        found = surface.settings.theory if isinstance(surface, Recipe) else surface.theory
         if props.get("theory", found) != found:
             raise RequestError(f"theory: got {theory!r} with a spectrum of {found} theory, wanted one built for it")
         return surface
@@ -239,7 +244,7 @@ def _inside(props: mi.Properties, media: Media, scale: float, recipe: Recipe) ->
     Parameters that do not match the recipe are refused here, before a table is computed.
     """
     settings, overrides = recipe.settings, dict[str, Any]()
-    if settings.theory == "rigorous":
+    if isinstance(settings, RigorousSettings):
         refuse_scalar_only(props)
         if settings.transmission != "none":
             check_transmission(settings.transmission, media)

@@ -7,7 +7,6 @@ import inspect
 import os
 from collections.abc import Callable, Iterable, Sequence
 from contextlib import suppress
-from dataclasses import fields
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -19,7 +18,7 @@ from ..errors import RequestError
 from ..files import refuse_other_than_utf8
 from ..progress import say
 from ..recipe import Recipe
-from ..settings import SUN_COHERENCE_LENGTH, Settings
+from ..settings import SPECTRUM_PARAMETERS, SUN_COHERENCE_LENGTH, Settings
 from ..surface.gratings import PROFILES
 from ..surface.prepare import STEP_NAMES, step_of
 
@@ -187,8 +186,8 @@ def options_of_scan(context: typer.Context) -> dict[str, object]:
 
 
 def settings_of(context: typer.Context) -> dict[str, Any]:
-    """Return the given options of the spectrum, under their names in `Settings`."""
-    given = given_of(context, [field.name for field in fields(Settings)])
+    """Return the given options of the spectrum, by name."""
+    given = given_of(context, SPECTRUM_PARAMETERS)
     return {name: converted(value) if name == "int_ior" else value for name, value in given.items()}
 
 
@@ -204,7 +203,7 @@ def recipe_of(source: Path, of_scan: dict[str, Any], settings: dict[str, Any], e
     Scans are samples by default, as they are rarely cut to whole periods.
     """
     if source.suffix.lower() != ".toml":
-        return Recipe({"scan": source.name, **of_scan}, Settings(**{"extent": extent, **settings}), source.parent)
+        return Recipe({"scan": source.name, **of_scan}, Settings.of(**{"extent": extent, **settings}), source.parent)
     if of_scan:
         names = ", ".join(f"--{name.replace('_', '-')}" for name in of_scan)
         raise RequestError(f"{names} go with a scan; the recipe {source} has its own")

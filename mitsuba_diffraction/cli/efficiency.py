@@ -16,7 +16,7 @@ from ..peaks import check_request, peak_efficiencies
 from ..precomputation import load_spectrum
 from ..progress import progress_bar, tell
 from ..recipe import Recipe, parameters_of_profile
-from ..settings import Settings
+from ..settings import ScalarSettings
 from .arguments import (
     Overwrite,
     Value,
@@ -77,11 +77,12 @@ def efficiency(
         recipe = _recipe(name, values, of_scan, of_spectrum)
     elif options := ", ".join([*values, *of_scan, *of_spectrum]):
         raise RequestError(f"{name}: got {options} with a saved spectrum, wanted the recipe or the scan itself")
-    settings = Settings() if recipe is None else recipe.settings
-    theory, transmission = theory or settings.theory, transmission or settings.transmission
+    settings = ScalarSettings() if recipe is None else recipe.settings
+    chosen = settings.chosen
+    theory, transmission = theory or settings.theory, transmission or chosen.get("transmission", "none")
     index: complex | str | None = None if int_ior is None else converted(int_ior)
     if material is None and int_ior is None:
-        material, index = settings.material, settings.int_ior
+        material, index = chosen.get("material"), chosen.get("int_ior")
     if csv is not None:
         check_suffix("--csv", csv, ".csv")
     if plot is not None:

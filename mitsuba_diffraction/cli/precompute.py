@@ -8,12 +8,9 @@ from typing import Annotated
 import typer
 
 from ..errors import RequestError
-from ..grating_spectrum import GratingSpectrum
 from ..outputs import check_outputs
-from ..precomputation import Spectrum
 from ..progress import durations, progress_bar, stage, tell
 from ..recipe import Recipe
-from ..rigorous.rigorous_spectrum import RigorousSpectrum
 from ..settings import ORIGINS, REPRESENTATIONS, SUN_COHERENCE_LENGTH, THEORIES
 from ..surface.prepare import is_seam_visible, seam_steps
 from .arguments import (
@@ -90,28 +87,10 @@ def _precompute(source: Path, recipe: Recipe, target: Path, seam: str) -> None:
             spectrum.save(target)
     tell(
         f"{target}: {spectrum.source}; {spectrum.extent}, {spectrum.grid}; coherence length "
-        f"{spectrum.coherence_length:.4g} µm; {_table_summary(spectrum)}{seam}"
+        f"{spectrum.coherence_length:.4g} µm; {spectrum.summary}{seam}"
     )
-    for text in (spectrum.excess, spectrum.warning) if isinstance(spectrum, GratingSpectrum) else ():
-        if text:
-            tell(f"! {text}")
-
-
-def _table_summary(spectrum: Spectrum) -> str:
-    size, tolerance = f"{spectrum.megabytes:.3g} MB", f"(tolerance {spectrum.tolerance:.3g})"
-    if isinstance(spectrum, RigorousSpectrum):
-        return (
-            f"rigorous, {spectrum.material_name}, {size}, mean error {spectrum.error:.1e} {tolerance}\n"
-            f"maximum error {spectrum.max_error:.1e} of the reflected light, {spectrum.max_error_near:.1e} near a "
-            "Rayleigh anomaly"
-            + ("" if spectrum.mueller is None else f"; Mueller matrices, mean {spectrum.polarisation_error:.1e}")
-        )
-    scatter = f", standard error of one scan {spectrum.standard_error:.2g}" if spectrum.extent == "sample" else ""
-    return (
-        f"{spectrum.representation}, {size}, error {spectrum.error:.1e} {tolerance}{scatter}\n"
-        f"truncated, at most: {spectrum.truncated_power:.1e} of the power at weak frequencies; "
-        f"{spectrum.unresolved_power:.1e} at frequencies that no direction reaches or no pixel resolves"
-    )
+    for concern in spectrum.concerns:
+        tell(f"! {concern}")
 
 
 def _seam(source: Path, recipe: Recipe) -> str:

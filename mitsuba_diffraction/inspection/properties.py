@@ -13,7 +13,7 @@ from ..outputs import plain
 from ..precomputation import precompute
 from ..progress import Progress, part, silent
 from ..scalar_theory import ScalarError, scalar_error
-from ..settings import SUN_COHERENCE_LENGTH, VISIBLE, Settings, lobe_width
+from ..settings import SUN_COHERENCE_LENGTH, VISIBLE, ScalarSettings, lobe_width
 from ..spectrum.sample import effective_coherence_length, standard_error
 from ..surface.heightfield import HeightField
 from ..surface.periods import Period, find_periods, hann
@@ -109,7 +109,7 @@ def inspect(
     Raises:
         ValueError: on an unknown extent, a coherence length that is not positive, or a sample of too few pixels.
     """
-    Settings(extent, coherence_length)
+    ScalarSettings(extent=extent, coherence_length=coherence_length)
     sun = SUN_COHERENCE_LENGTH
     limit = effective_coherence_length(height_field, sun) if extent == "sample" else max(sun, coherence_length)
     used = min(float(coherence_length), limit)

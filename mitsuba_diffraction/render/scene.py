@@ -24,8 +24,7 @@ from ..bsdf.light import cover_light, recorded_wavelengths
 from ..errors import RequestError, root_cause
 from ..files import refuse_other_than_utf8
 from ..llvm import is_supported
-from ..precomputation import is_rigorous
-from ..recipe import Recipe
+from ..recipe import Recipe, theory_in
 from ..settings import VISIBLE
 
 _log = logging.getLogger(__name__)
@@ -396,9 +395,7 @@ def _has_base(values: Mapping[str, bool | float | str]) -> bool:
     if {"material", "base"} & values.keys() or values.get("transmission", "none") != "none":
         return False
     path = _resolved(values.get("filename", ""))
-    if path.suffix.lower() == ".toml" and path.is_file():
-        return Recipe.load(path).settings.theory == "scalar"
-    return values.get("theory") != "rigorous" and not is_rigorous(path)
+    return "rigorous" not in (values.get("theory"), theory_in(path) if path.is_file() else "scalar")
 
 
 def _transmits(props: mi.Properties) -> bool:

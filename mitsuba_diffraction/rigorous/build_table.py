@@ -23,7 +23,7 @@ from ..errors import RequestError
 from ..files import whole_file
 from ..materials import index_of, refractive_index
 from ..progress import Progress, silent, stage
-from ..settings import Settings
+from ..settings import RigorousSettings
 from ..surface.heightfield import HeightField
 from .coordinate_transformation import (
     ABOVE,
@@ -93,7 +93,7 @@ MAX_POLARISATION_ERROR = 3.0
 
 def build_rigorous(
     height_field: HeightField,
-    settings: Settings,
+    settings: RigorousSettings,
     progress: Progress = silent,
     checkpoints: Path | None = None,
 ) -> RigorousSpectrum:
@@ -166,7 +166,7 @@ class _Surface:
         harmonics: N, which keeps a tenth of the tolerance at the shortest wavelength.
     """
 
-    def __init__(self, height_field: HeightField, settings: Settings, tolerance: float) -> None:
+    def __init__(self, height_field: HeightField, settings: RigorousSettings, tolerance: float) -> None:
         self.period = height_field.tile_size[0]
         self.wavelengths = settings.wavelengths[0] * 1e-3, settings.wavelengths[1] * 1e-3
         self.material = settings.int_ior, settings.material, settings.ext_ior

@@ -312,10 +312,24 @@ class RigorousSpectrum:
         """Indices of the media of side 0 and side 1, relative to side 0."""
         return 1.0, self.int_ior.real if self.transmission == "interface" else 1.0
 
-    # Attributes that `GratingSpectrum` has, too.
+    # As in `GratingSpectrum`.
+    theory = representation = "rigorous"
     extent = "tile"
-    representation = "rigorous"
-    largest_angle = 90.0
+
+    @property
+    def concerns(self) -> list[str]:
+        """None; an error above the tolerance raises a warning when the table is built."""
+        return []
+
+    @property
+    def summary(self) -> str:
+        """The table and its errors, in two lines."""
+        return (
+            f"rigorous, {self.material_name}, {self.megabytes:.3g} MB, mean error {self.error:.1e} (tolerance "
+            f"{self.tolerance:.3g})\nmaximum error {self.max_error:.1e} of the reflected light, "
+            f"{self.max_error_near:.1e} near a Rayleigh anomaly"
+            + ("" if self.mueller is None else f"; Mueller matrices, mean {self.polarisation_error:.1e}")
+        )
 
     @property
     def wavelengths(self) -> tuple[float, float]:

@@ -1,6 +1,7 @@
 """The BSDF of rigorous efficiencies, against its table in float64 and against the solver."""
 
 import dataclasses
+import weakref
 from pathlib import Path
 
 import drjit as dr
@@ -11,6 +12,7 @@ from bsdf_support import check_chi_square, direction, evaluate, interaction, mad
 
 import mitsuba_diffraction as md
 from mitsuba_diffraction import testing
+from mitsuba_diffraction.bsdf import shared
 from mitsuba_diffraction.geometry import horizon_gain
 from mitsuba_diffraction.rigorous.rigorous_spectrum import RigorousSpectrum
 from mitsuba_diffraction.rigorous.solver import mueller
@@ -54,6 +56,12 @@ def spectrum(request):
 
 def plugin(spectrum, **parameters):
     return mi.load_dict({"type": "diffraction_grating", "spectrum": spectrum, **parameters})
+
+
+def test_instances_of_one_table_share_it(llvm, monkeypatch):
+    monkeypatch.setattr(shared, "_shared", weakref.WeakValueDictionary())
+    one, other = (plugin(made_up(3.0)).layers.grating.theory.scattering for _ in range(2))
+    assert one is other
 
 
 def expected(spectrum, wi, wo, wavelength):

@@ -14,10 +14,10 @@ from mitsuba_diffraction.rigorous import build_table
 from mitsuba_diffraction.rigorous.build_table import build_rigorous
 from mitsuba_diffraction.rigorous.rigorous_spectrum import Axes, RigorousSpectrum, interval_bounds, interval_of
 from mitsuba_diffraction.scalar_theory import fresnel
-from mitsuba_diffraction.settings import Settings
+from mitsuba_diffraction.settings import RigorousSettings
 
 SURFACE = gratings.blazed(0.3, 0.05, samples=64)
-REQUEST = Settings(theory="rigorous", int_ior=1.5, wavelengths=(400.0, 500.0), tolerance=0.2, coherence_length=40.0)
+REQUEST = RigorousSettings(int_ior=1.5, wavelengths=(400.0, 500.0), tolerance=0.2, coherence_length=40.0)
 
 
 def coarse(steps, request):
@@ -351,7 +351,7 @@ def test_a_build_succeeds_without_a_usable_checkpoint(tmp_path, monkeypatch):
             "sheet with material 'Al' and int_ior None, wanted a dielectric",
         ),
         ({"transmission": "interface", "ext_ior": 1.3}, "and ext_ior 1.3, wanted no coat"),
-        ({"theory": "scalar"}, "wanted none of them"),
+        ({"theory": "scalar"}, "got scalar with int_ior 1.5, wanted none"),
         ({"height_field": gratings.crossed(2.0, 0.2, samples=8)}, "rows that differ"),
         ({"height_field": [SURFACE, SURFACE]}, r"theory: got rigorous and 2 patches .*, wanted one, of one row"),
         ({"largest_height_range": 0.04}, r"heights: got a range of 0\.049\d* µm, wanted at most 0\.04"),

@@ -1,6 +1,7 @@
 """The promise of a tolerance, measured against direct sums in float64, and the analytic gratings."""
 
 import importlib
+import inspect
 import tracemalloc
 
 import numpy as np
@@ -682,3 +683,15 @@ def test_building_takes_at_most_four_times_the_memory_of_the_result(extent):
     # One transform: a complex number for each pixel, or for each frequency of the lattice.
     transform = 16 * max(field.heights.size, int(np.prod(spectrum.grid.shape)))
     assert peak <= 4 * (spectrum.table.nbytes + transform), (peak, spectrum.table.nbytes, transform)
+
+
+def test_a_misspelt_parameter_is_refused_by_its_name():
+    with pytest.raises(TypeError, match=r"precompute\(\) got an unexpected keyword argument 'tolerence'"):
+        precompute(HeightField(np.zeros((4, 6)), 0.05), tolerence=0.1)
+
+
+def test_the_signature_has_the_parameters_of_both_theories():
+    found = {name: value.default for name, value in inspect.signature(precompute).parameters.items()}
+    assert list(found)[:2] == ["height_field", "progress"]
+    assert (found["theory"], found["extent"], found["coherence_length"], found["ext_ior"]) == ("scalar", "tile", 65, 1)
+    assert len(found) == 17

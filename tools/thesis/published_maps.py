@@ -36,7 +36,7 @@ from mitsuba_diffraction.outputs import METADATA
 from mitsuba_diffraction.progress import Progress, progress_bar, show, silent
 from mitsuba_diffraction.progress import table as progress_table
 from mitsuba_diffraction.recipe import Recipe
-from mitsuba_diffraction.settings import Settings
+from mitsuba_diffraction.settings import ScalarSettings
 from mitsuba_diffraction.surface.heightfield import HeightField
 from mitsuba_diffraction.testing import array, vectors
 
@@ -58,7 +58,7 @@ ENCODINGS = ("sRGB", "gamma 2.5")
 _MIRROR = 0.1  # sin θ_o; the pictures are saturated nearer to the mirror direction
 _LIGHT = (0.0, 0.0, 1.0)
 _COHERENCE_LENGTH = 65.0
-_SETTINGS = Settings(coherence_length=_COHERENCE_LENGTH, wavelengths=(380, 780), tolerance=0.01)
+_SETTINGS = ScalarSettings(coherence_length=_COHERENCE_LENGTH, wavelengths=(380, 780), tolerance=0.01)
 # Relative radiance and the pictures' conversion of colours, so that maps differ by the light alone.
 _QUIRKS = {
     PUBLISHED: Quirks.as_published(),

@@ -12,7 +12,7 @@ from numpy.typing import ArrayLike, NDArray
 from mitsuba_diffraction.evaluation.benchmark.cases import scan
 from mitsuba_diffraction.grating_spectrum import GratingSpectrum
 from mitsuba_diffraction.recipe import Recipe
-from mitsuba_diffraction.settings import SUN_COHERENCE_LENGTH, Settings
+from mitsuba_diffraction.settings import SUN_COHERENCE_LENGTH, ScalarSettings
 from mitsuba_diffraction.surface.heightfield import HeightField
 
 
@@ -81,12 +81,13 @@ class PublishedSurface:
 def _skin(profile: str, depth: float) -> Recipe:
     """Return the surface of precompute/elaphe.toml or xenopeltis.toml."""
     return Recipe(
-        {"profile": profile, "size": 32.0, "depth": depth, "seed": 1, "patches": 1}, Settings(coherence_length=26.0)
+        {"profile": profile, "size": 32.0, "depth": depth, "seed": 1, "patches": 1},
+        ScalarSettings(coherence_length=26.0),
     )
 
 
 # Nearly half of the scan, the largest coherence length that it supports.
-_AS_SAMPLE = Settings(extent="sample", coherence_length=32.0, tolerance=0.01)
+_AS_SAMPLE = ScalarSettings(extent="sample", coherence_length=32.0, tolerance=0.01)
 
 
 SURFACES = {

@@ -9,7 +9,7 @@ from ...cli.examples import source
 from ...grating_spectrum import GratingSpectrum
 from ...precomputation import precompute
 from ...recipe import Recipe
-from ...settings import SUN_COHERENCE_LENGTH, Settings
+from ...settings import SUN_COHERENCE_LENGTH, ScalarSettings, Settings
 from ...spectrum.sample import effective_coherence_length
 from ...surface import gratings
 from ...surface.heightfield import HeightField
@@ -101,7 +101,7 @@ def tiles() -> list[Case]:
         for depth in (0.15, 0.375, 0.6)
     ]
     for name, height_range in MEASURED.items():
-        whole = scan(name, height_range, Settings()).height_field()
+        whole = scan(name, height_range, ScalarSettings()).height_field()
         field = HeightField(whole.heights[_CROP, _CROP], whole.pixel_size, source=f"centre of {whole.source}")
         cases.append(Case(f"measured {name.capitalize()}", field, "tile", SUN_COHERENCE_LENGTH))
     return cases

@@ -16,7 +16,7 @@ from ...files import whole_file
 from ...grating_spectrum import GratingSpectrum
 from ...outputs import METADATA
 from ...progress import Progress, silent, table
-from ...settings import VISIBLE, Settings
+from ...settings import VISIBLE, ScalarSettings
 from ...spectrum.tables import SliceTable
 from .. import report
 from . import sampling, shader_speed
@@ -111,7 +111,7 @@ def run_benchmark(
         ValueError: if a tolerance is out of range, or a surface too large for it.
     """
     for tolerance in tolerances:
-        Settings(tolerance=tolerance)
+        ScalarSettings(tolerance=tolerance)
     cases = list(cases)
     results, shaders, total = [], [], len(cases) * len(tolerances)
     progress(0, total)

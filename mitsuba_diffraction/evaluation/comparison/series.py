@@ -29,7 +29,7 @@ from ...render import SpectralImage
 from ...render.film import pass_seed, trace_pass
 from ...render.passes import Accumulation, split
 from ...render.scene import channel_wavelengths, load_spectral_scene
-from ...settings import ORIGINS, SERIES, Settings
+from ...settings import ORIGINS, SERIES, ScalarSettings
 from ..realtime_shader.surfaces import gratings_of
 from .difference import as_shown, white_luminance
 from .pictures import Picture
@@ -131,7 +131,7 @@ def study(
     own = {"representation": SERIES[0], **(parameters or {})}
     kind = own["representation"]
     for origin, count in itertools.product(origins, terms):
-        Settings(representation=kind, terms=count, heights_from=origin)
+        ScalarSettings(representation=kind, terms=count, heights_from=origin)
     wanted = [{"representation": "auto", "terms": "auto", "heights_from": "mean"}]
     wanted += [{"terms": str(count), "heights_from": origin} for origin in origins for count in terms]
     rows: list[Row] = []
