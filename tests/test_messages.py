@@ -78,6 +78,12 @@ def test_messages_name_what_is_available(body, parameters, words, tmp_path, llvm
             "wanted a scene (.xml); this folder holds bulb.xml, desk_lamp.xml, lamp.xml, lamps.xml, "
             "parallel.xml, strip_along_x.xml, strip_along_y.xml, sun.xml",
         ),
+        ("render scenes/scan.xml -D spectrum=compact_disk", "did you mean compact_disc?"),
+        ("render scenes/blaze.xml --material surface=compact_disk", "did you mean compact_disc?"),
+        *(
+            (f"{name} compact_disk", "compact_disk: no file and no surface has this name; did you mean compact_disc?")
+            for name in ("inspect", "precompute", "view", "efficiency", "validate")
+        ),
         ("render scenes/foil.xml", "no such file; it is made by: python scenes/foil.py && python scenes/ground.py"),
     ],
 )

@@ -80,7 +80,7 @@ def test_scene_of_transmitted_light_renders(llvm, name, parameters):
 @pytest.mark.slow
 def test_scene_of_a_scan_renders(llvm, tmp_path):
     path = tmp_path / "spectrum.exr"
-    md.precompute(md.gratings.elaphe(8)).save(path)
+    md.precompute(md.gratings.elaphe_synthetic(8)).save(path)
     check(render(SCENES / "scan.xml", spp=4, width=16, height=16, parameters={"spectrum": str(path)}), 16, 16)
 
 

@@ -52,8 +52,8 @@ def render(
     material: Annotated[
         list[str] | None,
         typer.Option(
-            metavar="ID=RECIPE|PROFILE[,name=value…]",
-            help="replace the BSDF of this id by a grating; name=value: parameters of the grating",
+            metavar="ID=SURFACE[,name=value…]",
+            help="replace the BSDF of this id by a grating: a recipe, profile or spectrum; name=value: its parameters",
         ),
     ] = None,
     until_error: Annotated[

@@ -8,7 +8,6 @@ import os
 import re
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
-from difflib import get_close_matches
 from pathlib import Path
 from typing import Any
 
@@ -21,11 +20,11 @@ from numpy.typing import NDArray
 from ..bsdf.base import gratings_in, is_grating
 from ..bsdf.diffraction_grating import check
 from ..bsdf.light import cover_light, wavelengths_of
-from ..errors import RequestError, root_cause
+from ..errors import RequestError, did_you_mean, root_cause
 from ..files import refuse_other_than_utf8
 from ..llvm import is_supported
 from ..precomputation import is_rigorous
-from ..recipe import Recipe
+from ..recipe import Recipe, source_named
 from ..settings import VISIBLE
 
 _log = logging.getLogger(__name__)
@@ -471,14 +470,16 @@ def files_of_scene(
 
 
 def _refuse_missing_files(path: Path, state: mi.parser.ParserState) -> None:
-    """Raise RequestError if a mesh or texture is missing, before spectra are computed for the scene.
+    """Raise RequestError if a mesh, texture or named surface is missing, before spectra are computed for the scene.
 
     The message quotes the command that a comment of the scene gives for them: "… made by: python scenes/disc.py".
     """
     for node in state.nodes:
         name = node.props.get("filename")
-        # The error of the grating lists the available spectra.
-        if not isinstance(name, str) or node.props.plugin_name() == "diffraction_grating":
+        if not isinstance(name, str):
+            continue
+        if node.props.plugin_name() == "diffraction_grating":
+            source_named(str(_resolved(name)))  # if it is a file, the error of the grating lists the available spectra
             continue
         if not _resolved(name).is_file():
             text = path.read_text(encoding="utf-8", errors="replace")
@@ -643,8 +644,7 @@ def _alternatives(scene: Path, error: str) -> str:
     if (missing := re.search(r"undefined parameter: \$(\w+)", error)) is not None:
         return f"; set it by -D {missing[1]}=…"
     if (missing := re.search(r'Plugin "(\w+)" not found', error)) is not None:
-        similar = get_close_matches(missing[1], _PLUGINS, n=1)
-        return f"; did you mean {similar[0]}?" if similar else ""
+        return did_you_mean(missing[1], _PLUGINS)
     if "unused parameters" in error:
         text = scene.read_text(encoding="utf-8", errors="replace")
         known = sorted({*re.findall(r"\$(\w+)", text), *re.findall(r'<default\s+name="(\w+)"', text)})
