@@ -46,14 +46,14 @@ from functools import cached_property
 from pathlib import Path
 from typing import Any
 
-from .errors import RequestError, check_whole
-from .files import cache_folder, refuse_special
+from .errors import RequestError, check_whole, did_you_mean
+from .files import cache_folder, examples_folder, refuse_special
 from .grating_spectrum import SCALAR_FORMAT_VERSION
 from .materials import is_file
 from .precomputation import Spectrum, build_spectrum, build_versions, is_rigorous, load_spectrum
 from .progress import Progress, no_progress, part, silent, stage
 from .settings import SPECTRUM_PARAMETERS, ScalarSettings, Settings
-from .surface.gratings import COHERENCE_LENGTHS, PATCHES, PROFILES
+from .surface.gratings import COHERENCE_LENGTHS, PATCHES, PROFILES, RENAMED, profile_name
 from .surface.heightfield import HeightField
 from .surface.prepare import apply_steps, check_steps
 from .surface.readers import read_height_field
@@ -88,6 +88,31 @@ def parameters_of_profile(name: str) -> tuple[str, ...]:
     return (*inspect.signature(PROFILES[name]).parameters, "patches", *_OF_PROFILE)
 
 
+def source_named(name: str) -> str:
+    """Return the name of a profile or of a file as it is, and for the name of a recipe in the package its path.
+
+    Raises:
+        RequestError: if the name has no suffix, and there is no such file, profile or recipe.
+
+    Warns:
+        FutureWarning: if the name was that of another surface.
+    """
+    if name in PROFILES or Path(name).suffix or os.path.exists(name):
+        return name
+    recipes = {path.stem: path for path in sorted((examples_folder() / "precompute").glob("*.toml"))}
+    if name not in recipes:
+        similar = did_you_mean(name, [*PROFILES, *recipes])
+        wanted = similar or f", wanted {', '.join(dict.fromkeys([*PROFILES, *recipes]))}, or a file"
+        raise RequestError(f"{name}: no file and no surface has this name{wanted}")
+    if name in RENAMED:
+        warnings.warn(
+            f"{name}: the measured skin; the synthetic one, which had this name until version 0.2, is {RENAMED[name]}",
+            FutureWarning,
+            stacklevel=2,
+        )
+    return str(recipes[name])
+
+
 @dataclass(frozen=True)
 class Recipe:
     """A surface and the parameters of its spectrum.
@@ -110,8 +135,8 @@ class Recipe:
         if ("profile" in self.surface) == ("scan" in self.surface):
             got = ", ".join(sorted(self.surface)) or "nothing"
             raise RequestError(f"[surface]: got {got}, wanted either a profile or a scan")
-        if "profile" in self.surface and self.surface["profile"] not in tuple(PROFILES):
-            raise RequestError(f"profile: got {self.surface['profile']!r}, wanted one of {', '.join(PROFILES)}")
+        if "profile" in self.surface:
+            object.__setattr__(self, "surface", {**self.surface, "profile": profile_name(self.surface["profile"])})
         if "profile" in self.surface and "patches" in self.surface:
             patches = self.surface["patches"]
             check_whole("patches", patches, 1, MAX_PATCHES)
@@ -140,8 +165,7 @@ class Recipe:
         Raises:
             ValueError: if a value is wrong, or there is no such profile.
         """
-        if name not in PROFILES:
-            raise RequestError(f"profile: got {name!r}, wanted one of {', '.join(PROFILES)}")
+        name = profile_name(name)
         given = {key: parameters[key] for key in parameters_of_profile(name) if key in parameters}
         default = {"coherence_length": COHERENCE_LENGTHS[name]} if name in COHERENCE_LENGTHS else {}
         of_spectrum = {key: given.pop(key) for key in _OF_PROFILE if key in given}

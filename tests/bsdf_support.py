@@ -32,7 +32,7 @@ SURFACES = {
     "deep blazed": lambda: md.gratings.blazed(PERIOD, 0.8),
     "sinusoidal": lambda: md.gratings.sinusoidal(PERIOD, 0.3),
     "corner": corner_blaze,
-    "elaphe": lambda: md.gratings.elaphe(8),
+    "elaphe": lambda: md.gratings.elaphe_synthetic(8),
 }
 
 

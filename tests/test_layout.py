@@ -30,7 +30,7 @@ LEVELS = {
     "energy": "energy",
     "rigorous": "rigorous",
     "theory": "efficiency peaks reference scalar_theory",
-    "precompute": "grating_spectrum precomputation inverse_design recipe",
+    "precompute": "grating_spectrum hologram precomputation inverse_design recipe",
     "bsdf": "bsdf",
     "render": "integrator render testing",
     "inspection": "inspection",

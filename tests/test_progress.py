@@ -14,7 +14,7 @@ import mitsuba_diffraction as md
 from mitsuba_diffraction import progress
 from mitsuba_diffraction.settings import ScalarSettings
 
-RUBBED = {"profile": "xenopeltis", "size": 5.0, "patches": 3}
+RUBBED = {"profile": "xenopeltis_synthetic", "size": 5.0, "patches": 3}
 
 
 def test_a_log_reports_in_one_line_that_a_spectrum_is_computed(llvm, capfd, monkeypatch):

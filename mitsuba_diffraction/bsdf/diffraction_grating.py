@@ -12,14 +12,14 @@ from ..errors import RequestError
 from ..manual import Parameter, listed
 from ..materials import DISPERSION
 from ..recipe import Recipe, parameters_of_profile
-from ..surface.gratings import PROFILES
+from ..surface.gratings import PROFILES, RENAMED
 from .base import base_from, living
 from .layers import Layers
 from .parameters import GratingRequest
 from .thin_film import MAX_THICKNESS
 
 PARAMETERS = (
-    Parameter("filename", "string", "a saved spectrum (.exr) or a recipe (.toml)"),
+    Parameter("filename", "string", "a saved spectrum (.exr), a recipe (.toml), or the name of a ready-made surface"),
     Parameter("spectrum", "GratingSpectrum or RigorousSpectrum", "a spectrum from Python, in load_dict"),
     Parameter(
         "profile",
@@ -155,7 +155,7 @@ def refuse_wrong(props: mi.Properties) -> None:
     """
     types = {name: parameter.type for parameter in PARAMETERS for name in parameter.name.split(", ")}
     kinds, objects, profile = mi.Properties.Type, dict(props.objects()), props.get("profile")
-    is_known = isinstance(profile, str) and profile in PROFILES
+    is_known = isinstance(profile, str) and (profile := RENAMED.get(profile, profile)) in PROFILES
     nested = {name for name, value in objects.items() if isinstance(value, mi.BSDF)}  # `base_from` names others
     # `surface_from` lists the profiles.
     known = {*types, *(parameters_of_profile(profile) if is_known else ())}

@@ -16,7 +16,7 @@ from ..errors import RequestError, is_number
 from ..geometry import SHADOWING
 from ..materials import RefractiveIndex, is_file
 from ..precomputation import Spectrum, load_spectrum
-from ..recipe import REQUESTED, Recipe
+from ..recipe import REQUESTED, Recipe, source_named
 from ..rigorous.rigorous_spectrum import RigorousSpectrum
 from ..settings import (
     FROM_RADIUS,
@@ -271,6 +271,10 @@ def _from_file(props: mi.Properties, media: Media, scale: float) -> Spectrum | R
     """Return the spectrum or the recipe of a file."""
     path = Path(str(mi.file_resolver().resolve(str(props["filename"]))))
     given = _requested(props)
+    if not path.suffix:
+        path = Path(source_named(str(path)))
+        if str(path) in PROFILES:
+            return _inside(props, media, scale, Recipe.of_profile(str(path), given))
     suffix = path.suffix.lower()
     if suffix in (".toml", ".exr") and not path.is_file():
         # An unresolved path is relative; the resolver begins with the folder of the scene.

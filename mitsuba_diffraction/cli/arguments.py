@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from ..errors import RequestError
 from ..files import refuse_other_than_utf8
 from ..progress import say
-from ..recipe import Recipe
+from ..recipe import Recipe, source_named
 from ..settings import SPECTRUM_PARAMETERS, SUN_COHERENCE_LENGTH, Settings
 from ..surface.gratings import PROFILES
 from ..surface.prepare import STEP_NAMES, step_of
@@ -62,14 +62,14 @@ def check_suffix(option: str, path: Path, *suffixes: str) -> None:
 
 
 def surface_of(text: str) -> tuple[str, dict[str, Value]]:
-    """Return source and parameters from RECIPE|PROFILE[,name=value…]; numbers, true and false are converted."""
+    """Return source, as `source_named`, and parameters from SURFACE[,name=value…]; numbers and booleans converted."""
     source, *items = text.split(",")
     values: dict[str, Value] = {}
     for name, equals, value in (item.strip().partition("=") for item in items):
         if not (name and equals and value) or name in values:
             raise RequestError(f"{text}: got {name + equals + value!r}, wanted name=value, each name once")
         values[name] = converted(value)
-    return source, values
+    return source_named(source), values
 
 
 def is_scan(source: str) -> bool:
@@ -114,9 +114,9 @@ def materials_of(texts: Sequence[str] | None) -> dict[str, dict[str, Value]]:
     materials: dict[str, dict[str, Value]] = {}
     for text in texts or []:
         name, equals, rest = text.partition("=")
+        if not (name and equals and rest.partition(",")[0]):
+            raise RequestError(f"--material: got {text!r}, wanted ID=SURFACE[,name=value…]")
         source, values = surface_of(rest)
-        if not (name and equals and source):
-            raise RequestError(f"--material: got {text!r}, wanted ID=RECIPE|PROFILE[,name=value…]")
         if name in materials:
             raise RequestError(f"--material {name}: got it twice, wanted one grating")
         is_file = Path(source).suffix.lower() in (".toml", ".exr")
@@ -198,10 +198,14 @@ def given_of(context: typer.Context, names: Iterable[str]) -> dict[str, Any]:
 
 
 def recipe_of(source: Path, of_scan: dict[str, Any], settings: dict[str, Any], extent: str = "sample") -> Recipe:
-    """Return the recipe in a file, or a recipe of a scan; `settings` override a file's settings and a scan's extent.
+    """Return the recipe in a file, of a profile, or of a scan; `settings` override its own, and a scan's extent.
 
     Scans are samples by default, as they are rarely cut to whole periods.
     """
+    if str(source) in PROFILES:
+        if of_scan:
+            raise RequestError(f"{source}: got {', '.join(of_scan)} of a profile, wanted them of a scan")
+        return Recipe.of_profile(str(source), {}, **settings)
     if source.suffix.lower() != ".toml":
         return Recipe({"scan": source.name, **of_scan}, Settings.of(**{"extent": extent, **settings}), source.parent)
     if of_scan:

@@ -1,4 +1,4 @@
-"""`mitsuba-diffraction precompute`: a spectrum file from a recipe or a scan."""
+"""`mitsuba-diffraction precompute`: a spectrum file from a recipe, a profile or a scan."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ import typer
 from ..errors import RequestError
 from ..outputs import check_outputs
 from ..progress import durations, progress_bar, stage, tell
-from ..recipe import Recipe
+from ..recipe import Recipe, source_named
 from ..settings import ORIGINS, REPRESENTATIONS, SUN_COHERENCE_LENGTH, THEORIES
 from ..surface.prepare import is_seam_visible, seam_steps
 from .arguments import (
@@ -26,7 +26,7 @@ from .arguments import (
 @takes_scan
 def precompute(
     context: typer.Context,
-    sources: Annotated[list[Path], typer.Argument(metavar="RECIPE|SCAN...", help="recipes (.toml), or scans")],
+    sources: Annotated[list[Path], typer.Argument(metavar="SURFACE...", help="recipes (.toml), profiles, or scans")],
     output: Annotated[Path | None, typer.Option("-o", "--output", help="spectrum file; default: ./NAME.exr")] = None,
     representation: Annotated[str | None, typer.Option(help=f"{', '.join(REPRESENTATIONS)}; default: auto")] = None,
     tolerance: Annotated[
@@ -55,7 +55,8 @@ def precompute(
     largest_height_range: Annotated[float | None, typer.Option(help="refuse deeper surfaces, µm; default: 20")] = None,
     overwrite: Overwrite = False,
 ) -> None:
-    """Compute the power spectrum of the phase from recipes or scans."""
+    """Compute the power spectrum of the phase from recipes, profiles or scans."""
+    sources = [Path(source_named(str(source))) for source in sources]
     if output is not None and len(sources) > 1:
         raise RequestError(f"-o: got {len(sources)} sources, wanted one (without -o each is named after its source)")
     targets = [output or Path(source.name or "spectrum").with_suffix(".exr") for source in sources]
@@ -94,12 +95,12 @@ def _precompute(source: Path, recipe: Recipe, target: Path, seam: str) -> None:
 
 
 def _seam(source: Path, recipe: Recipe) -> str:
-    """Return a line on the seam of a scan that is repeated as a tile; "" for a recipe.
+    """Return a line on the seam of a scan that is repeated as a tile; "" for another surface.
 
     Raises:
         ValueError: if the seam would be visible.
     """
-    if source.suffix.lower() == ".toml":
+    if "scan" not in recipe.surface or source.suffix.lower() == ".toml":
         return ""
     steps = seam_steps(recipe.height_field())
     seam = " and ".join(

@@ -35,7 +35,7 @@ METALS = ("Al", "Ag", "Au", "Cr", "Cu", "W")
 """The conductors among which a page chooses, besides that of the surface."""
 
 DESIGN = "design of "  # in the title of a designed relief, see `inverse_design.result`
-_SKINS = ("elaphe", "xenopeltis")  # profiles
+_SKINS = ("elaphe_synthetic", "xenopeltis_synthetic")  # profiles
 
 # Radii of the hole, and of the inner and outer edge of the tracks, relative to 60 mm (IEC 60908, ECMA-267).
 _RINGS = dict(zip(DISCS, ((7.5 / 60, 23 / 60, 58.5 / 60), (7.5 / 60, 22.6 / 60, 58.5 / 60)), strict=True))

@@ -14,7 +14,7 @@ from ..grating_spectrum import GratingSpectrum
 from ..materials import refractive_index
 from ..precomputation import Spectrum, load_spectrum
 from ..progress import Progress, no_progress
-from ..recipe import Recipe, parameters_of_profile
+from ..recipe import Recipe, parameters_of_profile, source_named
 from ..settings import FROM_RADIUS, VISIBLE, wavelengths_inside
 from ..spectrum.tables import SliceTable
 from ..surface.gratings import PROFILES
@@ -170,14 +170,14 @@ class Surface:
             FileNotFoundError: if there is no such file.
             RequestError: if a parameter is wrong, or the page does not show such a surface.
         """
-        path, values = Path(source), dict(parameters)
+        path, values = Path(source_named(os.fspath(source))), dict(parameters)
         if path.suffix.lower() == ".exr":
             material = material_from(values)
             return cls(path.stem, load_spectrum(path), None, {"filename": path.name}, material)  # type: ignore[arg-type]
         if path.suffix.lower() == ".toml":
             recipe = Recipe.load(path)
             return cls.of_recipe(recipe, path.stem, {"filename": path.name}, values, progress=progress)
-        name = os.fspath(source)
+        name = str(path)
         if name not in PROFILES:
             raise RequestError(
                 f"surface: got {name!r}, wanted a recipe (.toml), a saved spectrum (.exr), a scan with its scale, or a "

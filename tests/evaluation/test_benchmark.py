@@ -24,7 +24,7 @@ from mitsuba_diffraction.settings import VISIBLE
 from mitsuba_diffraction.spectrum.tables import SliceTable
 
 BLAZE = Case("blaze", gratings.blazed(2.5, 0.25), "tile", 65.0)
-SKIN = Case("skin", gratings.elaphe(8.0, pixel_size=0.08), "sample", 2.0)
+SKIN = Case("skin", gratings.elaphe_synthetic(8.0, pixel_size=0.08), "sample", 2.0)
 
 
 @pytest.mark.few(1)

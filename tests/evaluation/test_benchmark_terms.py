@@ -16,7 +16,7 @@ from mitsuba_diffraction.evaluation.plots import save_png
 
 PERIOD, DEPTH = 2.5, 0.375
 SINUSOID = Case("sinusoid", gratings.sinusoidal(PERIOD, DEPTH, samples=64), "tile", 65.0)
-SKIN = Case("skin", gratings.elaphe(8.0, pixel_size=0.125, seed=1), "tile", 65.0)
+SKIN = Case("skin", gratings.elaphe_synthetic(8.0, pixel_size=0.125, seed=1), "tile", 65.0)
 
 
 def errors_of(case):

@@ -190,7 +190,12 @@ def test_no_surface_within_the_promised_range_is_warned_of(name, period):
 
 
 def test_built_in_surfaces_of_long_period_raise_no_warning():
-    for surface in (md.gratings.blazed(), md.gratings.compact_disc(), md.gratings.elaphe(), md.gratings.xenopeltis()):
+    for surface in (
+        md.gratings.blazed(),
+        md.gratings.compact_disc(),
+        md.gratings.elaphe_synthetic(),
+        md.gratings.xenopeltis_synthetic(),
+    ):
         assert scalar_theory.scalar_error(surface).warning == ""
 
 

@@ -279,7 +279,7 @@ def test_deep_surfaces_keep_the_tolerance(depth):
 
 @pytest.mark.parametrize(("tolerance", "words"), [(1e-2, 1), (1e-3, 2), (1e-4, 4)])
 def test_slices_have_the_smallest_format_that_keeps_the_tolerance(tolerance, words):
-    spectrum = precompute(md.gratings.xenopeltis(8.0), tolerance=tolerance)
+    spectrum = precompute(md.gratings.xenopeltis_synthetic(8.0), tolerance=tolerance)
     assert spectrum.table.words_per_node == words
     assert spectrum.error <= tolerance
 
@@ -288,7 +288,7 @@ def test_slices_have_the_smallest_format_that_keeps_the_tolerance(tolerance, wor
 @pytest.mark.few(2)
 @pytest.mark.parametrize(("coherence_length", "lattice"), [(12.0, False), (8.0, False), (2.0, True), (0.7, True)])
 def test_a_tile_is_read_from_a_lattice_where_its_lobes_overlap_widely(coherence_length, lattice):
-    field = md.gratings.xenopeltis(8.0, seed=2)
+    field = md.gratings.xenopeltis_synthetic(8.0, seed=2)
     spectrum = precompute(field, coherence_length=coherence_length, tolerance=1e-2)
     assert isinstance(spectrum.grid, SplineGrid) == lattice
     assert spectrum.extent == "tile"
@@ -624,7 +624,7 @@ def test_too_large_a_table_is_refused(monkeypatch, extent):
 
 
 def test_a_table_too_large_in_one_format_takes_the_next(monkeypatch):
-    field = md.gratings.xenopeltis(8.0)
+    field = md.gratings.xenopeltis_synthetic(8.0)
     first = precompute(field, tolerance=1e-2).table
     assert first.words_per_node == 1
     module = importlib.import_module("mitsuba_diffraction.spectrum.build")

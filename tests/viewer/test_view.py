@@ -106,7 +106,7 @@ def test_a_page_holds_everything_is_small_and_ready_within_three_seconds(recipe)
         ("blazed,height_scale=2", "height_scale: got 2, wanted at most 1: the spectrum was built for wavelengths"),
         ("blazed,orientation=round", "orientation: got 'round', wanted degrees, radial or tangential"),
         ("blazed,int_ior=0.5", "int_ior: got 0.5, wanted an index above 1"),
-        ("blaze", "surface: got 'blaze', wanted a recipe (.toml), a saved spectrum (.exr), a scan with its scale, or"),
+        ("blazd", "blazd: no file and no surface has this name; did you mean blazed?"),
         ("gone.toml", "gone.toml: no such file"),
         ("rigorous.toml", "rigorous: got theory=rigorous, wanted a surface of scalar theory"),
     ],

@@ -67,7 +67,7 @@ FIGURES = (
         """$BLENDER_PYTHON scenes/blender.py $ADDON {out}/exported.xml
         mitsuba-diffraction render {out}/exported.xml -o {out}/blender.png --spp 128 --denoise \
             --material mat-Disc=compact_disc,material=Al,coat_ior=1.55,orientation=radial \
-            --material mat-Skin=xenopeltis --material mat-Glass=film --material mat-Foil=foil,material=Al""",
+            --material mat-Skin=xenopeltis_synthetic --material mat-Glass=film --material mat-Foil=foil,material=Al""",
         5,
         needs="a Python with bpy as $BLENDER_PYTHON, a checkout of Mitsuba-Blender as $ADDON (scenes/blender.py)",
     ),

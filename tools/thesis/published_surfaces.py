@@ -79,7 +79,7 @@ class PublishedSurface:
 
 
 def _skin(profile: str, depth: float) -> Recipe:
-    """Return the surface of precompute/elaphe.toml or xenopeltis.toml."""
+    """Return a surface like that of precompute/elaphe_synthetic.toml or xenopeltis_synthetic.toml."""
     return Recipe(
         {"profile": profile, "size": 32.0, "depth": depth, "seed": 1, "patches": 1},
         ScalarSettings(coherence_length=26.0),
@@ -100,8 +100,10 @@ SURFACES = {
         final={"flss": (2499.997, 0.377), "nmm": (2499.997, 0.377), "pq": (2502.428, 0.390)},
         angles=(-55.0, -40.0),
     ),
-    "elaphe": PublishedSurface("Elaphe (synthetic)", _skin("elaphe", 0.375), 1, 1.144, (1144.28, 0.15)),
-    "xenopeltis": PublishedSurface("Xenopeltis (synthetic)", _skin("xenopeltis", 0.443), 0, 1.552, (1552.27, 0.45)),
+    "elaphe": PublishedSurface("Elaphe (synthetic)", _skin("elaphe_synthetic", 0.375), 1, 1.144, (1144.28, 0.15)),
+    "xenopeltis": PublishedSurface(
+        "Xenopeltis (synthetic)", _skin("xenopeltis_synthetic", 0.443), 0, 1.552, (1552.27, 0.45)
+    ),
     "elaphe_scan": PublishedSurface(
         "Elaphe (scan)",
         scan("elaphe", 0.4347, _AS_SAMPLE),
