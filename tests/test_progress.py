@@ -12,9 +12,9 @@ from rich.console import Console
 
 import mitsuba_diffraction as md
 from mitsuba_diffraction import progress
-from mitsuba_diffraction.settings import Settings
+from mitsuba_diffraction.settings import ScalarSettings
 
-RUBBED = {"profile": "xenopeltis", "size": 5.0, "patches": 3}
+RUBBED = {"profile": "xenopeltis_synthetic", "size": 5.0, "patches": 3}
 
 
 def test_a_log_reports_in_one_line_that_a_spectrum_is_computed(llvm, capfd, monkeypatch):
@@ -29,7 +29,9 @@ def test_a_log_reports_in_one_line_that_a_spectrum_is_computed(llvm, capfd, monk
 
 def test_progress_begins_with_the_heights_and_never_decreases():
     reports = []
-    md.Recipe(RUBBED, Settings(coherence_length=3.0, tolerance=0.05)).build(lambda *numbers: reports.append(numbers))
+    md.Recipe(RUBBED, ScalarSettings(coherence_length=3.0, tolerance=0.05)).build(
+        lambda *numbers: reports.append(numbers)
+    )
     done, total = zip(*reports, strict=True)
     assert set(total) == {100}
     assert list(done) == sorted(done)

@@ -2,13 +2,11 @@
 
 from __future__ import annotations
 
-import itertools
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-import scipy.ndimage
 import scipy.special
 from numpy.typing import NDArray
 
@@ -136,6 +134,10 @@ class OrderGrid(_Rectangle):
         return x, y
 
 
+SHIFTS = (-0.25, 0.25)
+"""Of the nodes, in spacings, along each axis: lattices on which the error of splines is measured."""
+
+
 @dataclass(frozen=True)
 class SplineGrid(_Rectangle):
     """S(q; κ) = Σ_m c_m(κ) B(q_x/Δ_x − m_x) B(q_y/Δ_y − m_y)/(Δ_x Δ_y), B the centred quadratic B-spline, ∫B = 1.
@@ -196,7 +198,7 @@ class SplineGrid(_Rectangle):
         self,
         kept: OrderGrid | SplineGrid,
         coefficients: NDArray[np.float32],
-        exact: Callable[[float, float], NDArray[np.float64]],
+        exact: Callable[[int, int], NDArray[np.floating]],
         max_q: tuple[float, float],
     ) -> float:
         """Compute ∫|S_approx − S_exact| dq up to `max_q`, by the rectangle rule on a lattice of half the spacing.
@@ -204,20 +206,23 @@ class SplineGrid(_Rectangle):
         Args:
             kept: the smaller grid of the approximation.
             coefficients: c_m on it; zero outside.
-            exact: returns S Δ_x Δ_y, of the shape of this grid, on the lattice shifted by (x, y), in spacings.
+            exact: returns S Δ_x Δ_y, of the shape of this grid, at the nodes shifted by `SHIFTS[x]` and `SHIFTS[y]`.
             max_q: (x, y) in cycles/µm.
         """
-        padded, errors = np.zeros(self.shape), []
-        padded[inner(self, kept)] = coefficients
-        for shift in itertools.product((-0.25, 0.25), repeat=2):
-            weights_x, weights_y = (np.array(spline_weights(s)) for s in shift)
-            approximate = scipy.ndimage.correlate1d(padded, weights_x, axis=1, mode="constant")
-            approximate = scipy.ndimage.correlate1d(approximate, weights_y, axis=0, mode="constant")
+        padded, errors = np.zeros((self.shape[0] + 2, self.shape[1] + 2), np.float32), []
+        padded[1:-1, 1:-1][inner(self, kept)] = coefficients
+        axes = list(zip(self.axes(), self.spacing, max_q, strict=True))
+        for x, y in np.ndindex(2, 2):
+            approximate = padded
+            for axis, index in ((1, x), (0, y)):
+                nodes = np.lib.stride_tricks.sliding_window_view(approximate, 3, axis)
+                approximate = nodes @ np.array(spline_weights(SHIFTS[index]), np.float32)
             inside_x, inside_y = (
-                np.abs(m + s) * spacing <= end
-                for m, spacing, s, end in zip(self.axes(), self.spacing, shift, max_q, strict=True)
+                np.abs(m + SHIFTS[index]) * spacing <= end
+                for index, (m, spacing, end) in zip((x, y), axes, strict=True)
             )
-            errors.append(inside_y @ np.abs(np.maximum(approximate, 0) - exact(*shift)) @ inside_x)
+            difference = np.abs(np.maximum(approximate, 0) - exact(x, y))
+            errors.append(inside_y @ difference.astype(np.float64) @ inside_x)
         return float(np.mean(errors))
 
 

@@ -19,8 +19,9 @@ from numpy.typing import NDArray
 from ..errors import RequestError
 from ..settings import lobe_width
 from ..surface.heightfield import HeightField
-from .grids import OrderGrid, SplineGrid
+from .grids import SHIFTS, OrderGrid, SplineGrid
 from .tables import derivative_bound
+from .tile import phase_wave
 
 # Windows are truncated at ±3 σ_s, where their amplitude is e^{−9/2}, 1 %.
 _SUPPORT = 6.0
@@ -92,11 +93,6 @@ def mean_periodogram(
         transform = scipy.fft.fft(along_x, shape[0], axis=1, overwrite_x=True, workers=2)
         total += (transform.real**2 + transform.imag**2).sum(axis=0)
     return total / len(positions)
-
-
-def phase_wave(height_field: HeightField, kappa: float) -> NDArray[np.complex64]:
-    """Compute e^{iκh}, (rows, columns), in single precision; κ in rad/µm."""
-    return np.exp(1j * kappa * height_field.centred).astype(np.complex64)
 
 
 def _axis(count: int, pixel: float, sigma: float) -> WindowAxis:
@@ -177,7 +173,7 @@ class SamplePowers:
         width, height = len(axis_x.window), len(axis_y.window)
         # Padded with zeros, so that the lags do not wrap around.
         shape = scipy.fft.next_fast_len(2 * height - 1), scipy.fft.next_fast_len(2 * width - 1)
-        power = mean_periodogram(phase_wave(self._height_field, kappa), axis_x, axis_y, shape)
+        power = mean_periodogram(phase_wave(self._height_field.centred, kappa), axis_x, axis_y, shape)
         half = np.conj(scipy.fft.rfft2(power, norm="forward"))
         half = half[np.arange(-height + 1, height) % shape[0], :width]
         x, y = self._lags
@@ -217,8 +213,11 @@ class SamplePowers:
         """Return ∫|S_approx − S_exact| dq over the frequencies that light reaches; arguments of `TilePowers.error`."""
         autocorrelation = self._autocorrelation(kappa)
 
-        def exact(*shift: float) -> NDArray[np.float64]:
-            x, y = (np.exp(-2j * np.pi * s * lags.lags / lags.count) for s, lags in zip(shift, self._lags, strict=True))
+        def exact(*shift: int) -> NDArray[np.float64]:
+            x, y = (
+                np.exp(-2j * np.pi * SHIFTS[s] * lags.lags / lags.count)
+                for s, lags in zip(shift, self._lags, strict=True)
+            )
             return self._transform(autocorrelation * y[:, None] * x[self._lags[0].lags >= 0])
 
         return self.grid.error(kept, powers, exact, self._max_q)
@@ -268,7 +267,7 @@ def standard_error(
     )
     errors = []
     for kappa in max_kappa * np.arange(1, _KAPPA_COUNT + 1) / _KAPPA_COUNT:
-        variance = _batch_variance(phase_wave(height_field, kappa), axes) * correlation / (within - correlation)
+        variance = _batch_variance(phase_wave(height_field.centred, kappa), axes) * correlation / (within - correlation)
         smooth = scipy.ndimage.uniform_filter(variance, 3, mode="wrap")
         errors.append(inside_y @ np.sqrt(np.maximum(smooth, 0)) @ inside_x)
     return float(max(errors))

@@ -2,8 +2,11 @@
 
 from __future__ import annotations
 
+import os
 from collections.abc import Sequence
-from functools import cached_property
+from concurrent.futures import ThreadPoolExecutor
+from functools import cached_property, partial
+from typing import Any
 
 import numpy as np
 import scipy.fft
@@ -11,8 +14,18 @@ import scipy.linalg
 from numpy.typing import NDArray
 
 from ..surface.heightfield import HeightField
-from .grids import OrderGrid, SplineGrid, inner, spline
+from .grids import SHIFTS, OrderGrid, SplineGrid, inner, spline
 from .tables import derivative_bound
+
+
+def phase_wave(heights: NDArray[np.float64], kappa: float) -> NDArray[np.complex64]:
+    """Compute e^{iκh} in single precision, of the shape of the heights (µm); κ in rad/µm."""
+    turns = heights * (kappa / (2 * np.pi))
+    # Whole turns are removed in double precision.
+    phase = (2 * np.pi * (turns - np.rint(turns))).astype(np.float32)
+    wave = np.empty(heights.shape, np.complex64)
+    wave.real, wave.imag = np.cos(phase), np.sin(phase)
+    return wave
 
 
 class TilePowers:
@@ -23,9 +36,18 @@ class TilePowers:
         transforms: the number of Fourier transforms for one κ.
     """
 
-    def __init__(self, height_fields: Sequence[HeightField], max_frequency: float, lobe_radius: float) -> None:
-        """Take tiles of one size, the largest |q| that light reaches and the radius of a lobe, both in cycles/µm."""
-        self._heights = [field.centred for field in height_fields]
+    def __init__(
+        self, height_fields: Sequence[HeightField], max_frequency: float, lobe_radius: float, single: bool = False
+    ) -> None:
+        """Take the tiles, and what their orders are needed for.
+
+        Args:
+            height_fields: of one size.
+            max_frequency: the largest |q| that light reaches, cycles/µm.
+            lobe_radius: the radius of a lobe, cycles/µm.
+            single: whether to transform in single precision, whose error is below 1e-6 of the power.
+        """
+        self._heights, self.single = [field.centred for field in height_fields], single
         self.transforms = len(height_fields)
         tile_size, pixels = height_fields[0].tile_size, height_fields[0].shape[::-1]
         self.grid = OrderGrid.reachable(tile_size, pixels, max_frequency + lobe_radius)
@@ -34,10 +56,16 @@ class TilePowers:
     def __call__(self, kappa: float) -> NDArray[np.float64]:
         """Compute η_m(κ), (rows, columns); κ in rad/µm."""
         total = np.zeros(self._heights[0].shape)
-        for heights in self._heights:
-            transform = scipy.fft.fft2(np.exp(1j * kappa * heights), norm="forward", overwrite_x=True)
-            total += transform.real**2 + transform.imag**2
+        with ThreadPoolExecutor(os.cpu_count()) as pool:
+            for power in pool.map(partial(self._power, kappa), self._heights):
+                total += power
         return self.grid.take(total / self.transforms)
+
+    def _power(self, kappa: float, heights: NDArray[np.float64]) -> NDArray[np.floating]:
+        """Compute |F{e^{iκh}}|² of one tile."""
+        wave = phase_wave(heights, kappa) if self.single else np.exp(1j * kappa * heights)
+        transform = scipy.fft.fft2(wave, norm="forward", overwrite_x=True)
+        return transform.real**2 + transform.imag**2
 
     def derivative_bound(self, n: int) -> float:
         """Return an upper bound of Σ_m |∂ⁿη_m/∂κⁿ|, µmⁿ."""
@@ -77,6 +105,7 @@ class TileSplines:
     def __init__(self, powers: TilePowers, lobe_width: float, spacing: float, max_frequency: float) -> None:
         """Take η_m(κ), σ_q, and the largest spacing and frequency of the nodes, all in cycles/µm."""
         self._powers, self._sigma, self._spacing = powers, lobe_width, spacing
+        self._type = np.float32 if powers.single else np.float64
         self.transforms = powers.transforms
         self._orders = powers.grid.frequencies()
         # S is negligible further than six σ_q from the last order.
@@ -85,9 +114,19 @@ class TileSplines:
         self.grid = SplineGrid((spacing, spacing), (x, y), (np.inf, np.inf))
 
     @cached_property
-    def _projection(self) -> list[NDArray[np.float64]]:
+    def _projection(self) -> list[NDArray[Any]]:
         """A_x and A_y, computed when coefficients are first requested."""
-        return [self._projected(m, q) for m, q in zip(self.grid.max_order, self._orders, strict=True)]
+        return [
+            self._projected(m, q).astype(self._type) for m, q in zip(self.grid.max_order, self._orders, strict=True)
+        ]
+
+    @cached_property
+    def _lobes_between(self) -> list[list[NDArray[Any]]]:
+        """Along x and y: `_lobes` at the nodes shifted by each of `SHIFTS`, computed when the error is first needed."""
+        return [
+            [self._lobes(m + shift, orders).astype(self._type) for shift in SHIFTS]
+            for m, orders in zip(self.grid.axes(), self._orders, strict=True)
+        ]
 
     def _projected(self, max_order: int, orders: NDArray[np.float64]) -> NDArray[np.float64]:
         """Compute A, (nodes, orders), along one axis."""
@@ -109,7 +148,7 @@ class TileSplines:
     def __call__(self, kappa: float) -> NDArray[np.float64]:
         """Compute c_m(κ), (rows, columns), with Σ c = 1 over all frequencies; κ in rad/µm."""
         along_x, along_y = self._projection
-        return along_y @ self._powers(kappa) @ along_x.T
+        return (along_y @ self._powers(kappa).astype(self._type) @ along_x.T).astype(np.float64)
 
     def derivative_bound(self, n: int) -> float:
         """Return an upper bound of ∫|∂ⁿS/∂κⁿ| dq, µmⁿ: lobes have the same bound as their orders."""
@@ -121,12 +160,11 @@ class TileSplines:
 
     def error(self, kept: OrderGrid | SplineGrid, powers: NDArray[np.float32], kappa: float) -> float:
         """Return ∫|S_approx − S_exact| dq over the frequencies that light reaches; arguments of `TilePowers.error`."""
-        of_orders = self._powers(kappa)
+        lobes_x, lobes_y = self._lobes_between
+        of_orders = self._powers(kappa).astype(self._type)
+        along_y = [lobes @ of_orders for lobes in lobes_y]
 
-        def exact(*shift: float) -> NDArray[np.float64]:
-            along_x, along_y = (
-                self._lobes(m + s, orders) for m, s, orders in zip(self.grid.axes(), shift, self._orders, strict=True)
-            )
-            return along_y @ of_orders @ along_x.T
+        def exact(x: int, y: int) -> NDArray[np.floating]:
+            return along_y[y] @ lobes_x[x].T
 
         return self.grid.error(kept, powers, exact, self._max_q)

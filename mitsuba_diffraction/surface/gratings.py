@@ -14,6 +14,7 @@ Raises:
 
 from __future__ import annotations
 
+import warnings
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 
@@ -21,7 +22,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.special import erf
 
-from ..errors import RequestError, check_whole, is_number
+from ..errors import RequestError, check_whole, did_you_mean, is_number
 from .heightfield import HeightField, as_pixel_size
 
 MAX_PIXELS = 2**26
@@ -499,7 +500,7 @@ def smooth_step(x: Array, width: float) -> Array:
     return (1 + erf(x / width)) / 2
 
 
-def elaphe(
+def elaphe_synthetic(
     size: float | tuple[float, float] = 32.0,
     *,
     pixel_size: float = 0.0625,
@@ -597,7 +598,7 @@ def _elaphe_granules(canvas: Canvas, granules: Array, rng: np.random.Generator, 
             granules[index] = np.maximum(granules[index], granule)
 
 
-def xenopeltis(
+def xenopeltis_synthetic(
     size: float | tuple[float, float] = 32.0,
     *,
     pixel_size: float = 0.0625,
@@ -771,14 +772,48 @@ PROFILES: dict[str, Callable[..., HeightField]] = {
     "film": film,
     "compact_disc": compact_disc,
     "dvd": dvd,
-    "elaphe": elaphe,
-    "xenopeltis": xenopeltis,
+    "elaphe_synthetic": elaphe_synthetic,
+    "xenopeltis_synthetic": xenopeltis_synthetic,
     "morpho_ridges": morpho_ridges,
 }
 """Name in recipes and scenes → function."""
 
+RENAMED = {name: f"{name}_synthetic" for name in ("elaphe", "xenopeltis")}
+"""Name of a profile until version 0.2 → its name now, as the measured skins have the former."""
+
+
+def profile_name(name: object) -> str:
+    """Return the name of a profile.
+
+    Raises:
+        RequestError: if there is no such profile.
+
+    Warns:
+        FutureWarning: if the name is a former one.
+    """
+    if isinstance(name, str) and name in RENAMED:
+        warnings.warn(
+            f"profile {name}: got the former name of {RENAMED[name]}, a synthetic skin; the measured one is the recipe "
+            f"{name}.toml. The former name will be refused from version 0.4 on",
+            FutureWarning,
+            stacklevel=2,
+        )
+        return RENAMED[name]
+    if not (isinstance(name, str) and name in PROFILES):
+        raise RequestError(
+            f"profile: got {name!r}, wanted one of {', '.join(PROFILES)}{did_you_mean(str(name), PROFILES)}"
+        )
+    return name
+
+
+def __getattr__(name: str) -> Callable[..., HeightField]:
+    if name in RENAMED:
+        return PROFILES[profile_name(name)]
+    raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+
+
 COHERENCE_LENGTHS: dict[str, float] = dict.fromkeys(
-    ("compact_disc", "dvd", "elaphe", "xenopeltis", "morpho_ridges"), 26.0
+    ("compact_disc", "dvd", "elaphe_synthetic", "xenopeltis_synthetic", "morpho_ridges"), 26.0
 )
 """Name of a random profile → coherence length in µm suitable for its default tile of about 32 µm.
 
@@ -786,7 +821,10 @@ The periodic patch has a comb of orders spaced by 1/32 cycles/µm; a coherence l
 them into the smooth haze of an irregular surface.
 """
 
-PATCHES: dict[str, int] = {"compact_disc": 48, "dvd": 48, "elaphe": 16, "xenopeltis": 16, "morpho_ridges": 16}
+PATCHES: dict[str, int] = {
+    **{"compact_disc": 48, "dvd": 48},
+    **{"elaphe_synthetic": 16, "xenopeltis_synthetic": 16, "morpho_ridges": 16},
+}
 """Name of a random profile → number of seeds over which its spectrum is averaged by default.
 
 At 550 nm and normal incidence ∫|ΔS| dq relative to the mean over infinitely many other seeds is then below 0.08; for
