@@ -56,19 +56,30 @@ def k_g(
         min_v_z: lower bound of |v_z| in K of transmitted light.
         select: `numpy.where` or `drjit.select`.
     """
-    v_z = select(reflects, k_iz + k_oz, abs(k_iz - k_oz))
+
+    def either(reflected: Callable[[], Array], transmitted: Callable[[], Array]) -> Array:
+        if isinstance(reflects, bool):
+            return reflected() if reflects else transmitted()
+        return select(reflects, reflected(), transmitted())
+
+    v_z = either(lambda: k_iz + k_oz, lambda: abs(k_iz - k_oz))
     square = tangent_square + v_z * v_z
     a_i, a_o = abs(square + excess) / (2 * k_iz), abs(square - excess) / (2 * k_oz)
-    per_v_z = 1 / select(reflects, v_z, select(v_z > min_v_z, v_z, min_v_z))
+    per_v_z = 1 / either(lambda: v_z, lambda: select(v_z > min_v_z, v_z, min_v_z))
     k = a_i * per_v_z * (a_o * per_v_z)
     result = k
     if shadowing:
-        smaller, larger = select(a_i < a_o, a_i, a_o), select(a_i < a_o, a_o, a_i)
-        in_v_cavity = 2 * smaller * per_v_z
-        square_ratio = 4 * square / (larger * larger)
-        transmitted = select(square_ratio < 1, k * square_ratio, k)
-        result = select(reflects, select(k < in_v_cavity, k, in_v_cavity), transmitted)
-    return select(reflects | (square < abs(excess)), result, 0)
+        smaller, larger = _ordered(a_i, a_o, select)
+        bound = either(lambda: 2 * smaller * per_v_z, lambda: k * (4 * square / (larger * larger)))
+        result = _ordered(k, bound, select)[0]
+    return either(lambda: result, lambda: select(square < abs(excess), result, 0))
+
+
+def _ordered(a: Array, b: Array, select: Callable[..., Any]) -> tuple[Array, Array]:
+    """Return the minimum and the maximum, element by element."""
+    if select is np.where:  # which is slow
+        return np.minimum(a, b), np.maximum(a, b)
+    return select(a < b, a, b), select(a < b, b, a)
 
 
 @dataclass(frozen=True, eq=False)

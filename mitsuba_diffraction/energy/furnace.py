@@ -200,25 +200,36 @@ class Furnace:
         # Adjacent directions share most of their components.
         for batch in np.array_split(np.arange(len(directions)), 1 + len(directions) * len(self.q) // MAX_PAIRS):
             for branch in self.branches:
-                direction, _, value, cosine = self._terms(directions[batch], wavelengths[batch], branch)
-                for of_plane, plane in zip(result, planes, strict=True):
-                    factor = plane(cosine)[abs(branch)]
-                    of_plane[abs(branch), batch] += np.bincount(direction, value * factor, len(batch))
+                for direction, _, value, cosine in self._terms(directions[batch], wavelengths[batch], branch):
+                    for of_plane, plane in zip(result, planes, strict=True):
+                        power = value * plane(cosine)[abs(branch)]
+                        if value.ndim == 1:
+                            of_plane[abs(branch), batch] += np.bincount(direction, power, len(batch))
+                        else:
+                            of_plane[abs(branch), batch] += power.sum(-1, np.float64)
         return result
 
     def terms(self, directions: Real, length: Real, branch: int) -> tuple[Indices, Indices, Real]:
-        """Compute the terms of `albedo` for one branch of light: index of direction, of component, and value.
+        """Compute the terms of `albedo` for one branch of light: index of direction, of order, and value.
 
-        Component j diffracts light from ω to k_o,∥ = −ω_∥ − λ q_j, or −ω_∥ + λ q_j in branch −1, in units of n_i.
+        Order j diffracts light from ω to k_o,∥ = −ω_∥ − λ q_j, or −ω_∥ + λ q_j in branch −1, in units of n_i.
         """
-        i, j, value, cosine = self._terms(directions, length, branch)
+        ((i, j, value, cosine),) = self._terms(directions, length, branch)
         planes = self._planes
         return i, j, value * planes[len(planes) // 2](cosine)[abs(branch)]
 
-    def _terms(self, directions: Real, length: Real, branch: int) -> tuple[Indices, Indices, Real, Real]:
-        """Return the `terms` without R or T, and |ω_i·h|."""
+    def _terms(self, directions: Real, length: Real, branch: int) -> list[tuple[Indices, Indices, Real, Real]]:
+        """Return the `terms` without R or T, and |ω_i·h|, in parts of n terms each.
+
+        A part of (directions, components) has a term for each pair, and indices of shape (directions, 1) and
+        (components,).
+        """
+        if not self.by_order:
+            # Bins are wide; but an order is above the horizon or not.
+            directions, length = directions.astype(np.float32), length.astype(np.float32)
         s, cos_i, index = directions[:, :2], np.abs(directions[:, 2]), (branch and self.index) or 1.0
-        q, radius = self.q * (branch or 1), np.zeros(len(self.q)) if self.by_order else np.sqrt(3) * self.widths
+        q = (self.q * (branch or 1)).astype(length.dtype)
+        radius = np.zeros_like(q[:, 0]) if self.by_order else (np.sqrt(3) * self.widths).astype(length.dtype)
         middle, mean = s.mean(0), (length.min() + length.max()) / 2
         cutoff = index + np.hypot(*(s - middle).T).max() + (length.max() - mean) * np.hypot(*q.T)
         near = np.flatnonzero(np.hypot(*(middle + mean * q).T) < cutoff + length.max() * radius)
@@ -227,14 +238,10 @@ class Furnace:
         for k in np.flatnonzero(q.any(0)):
             u = np.multiply.outer(length, q[near, k])
             square -= u * (u + 2 * s[:, k, None]) / index**2
-        min_square = 0.0
         if not self.by_order:
-            radii = np.multiply.outer(length / index, radius[near])
-            min_square = -radii * (2 + radii)
-        i, j = np.nonzero(square > min_square)
+            return self._bin_terms(cos_i, length, near, np.sqrt(1 - square), branch)
+        i, j = np.nonzero(square > 0)
         square, j = square[i, j], near[j]
-        if not self.by_order:
-            return self._bin_terms(i, j, np.sqrt(1 - square), cos_i, length, branch)
         width = self.lobe_scale * self.spectrum.lobe_width
         sigma = length[i] * width
         cos_exit = cos_o = mean_cosine(square, sigma / index)
@@ -247,36 +254,55 @@ class Furnace:
         value, cosine = self._factor(mean_cos_i, cos_o, length, length**2 * (q**2).sum(-1)[j], branch)
         # Reflected light uses κ of the two directions; transmitted light uses κ of the order's exact direction.
         kappa = self._kappa(mean_cos_i if branch else cos_i, cos_o if branch else cos_exit, length, branch)
-        return i, j, weight * value * self._power(j, kappa, branch), cosine
+        return [(i, j, weight * value * self._power(j, kappa, branch), cosine)]
 
     def _bin_terms(
-        self, i: Indices, j: Indices, rho: Real, cos_i: Real, length: Real, branch: int
-    ) -> tuple[Indices, Indices, Real, Real]:
-        """Compute the `_terms` of directions i and bins j, whose centres have sin θ_o = ρ.
+        self, cos_i: Real, length: Real, bins: Indices, rho: Real, branch: int
+    ) -> list[tuple[Indices, Indices, Real, Real]]:
+        """Compute the `_terms` of directions (n,) and `bins` (m,), whose centres have sin θ_o = ρ, (n, m).
 
         Near the horizon a bin has three terms, at points in cos θ_o, as K G varies with that, over the radial extent
         ρ ± √3 σ.
         """
         index = (branch and self.index) or 1.0
-        sigma = length[i] * self.widths[j] / index
-        near_horizon, parts = (rho + np.sqrt(3) * sigma) ** 2 > 1 - MIN_COS_ONE_POINT**2, []
-        for count, chosen in ((1, np.flatnonzero(~near_horizon)), (3, np.flatnonzero(near_horizon))):
-            i_, j_ = np.tile(i[chosen], count), np.tile(j[chosen], count)
-            cos_o, r, weight = _above_horizon(rho[chosen], sigma[chosen], count)
-            length_, cos_ = length[i_], cos_i[i_]
-            # |λq|² along the line from the centre of the hemisphere
-            tangent, square = length_**2 * (self.q**2).sum(-1)[j_], 1 - cos_**2
-            rho_ = np.tile(rho[chosen], count)
-            tangent = square + index**2 * r**2 - r / np.maximum(rho_, 1e-12) * (index**2 * rho_**2 + square - tangent)
-            tangent = np.maximum(tangent, 0) + (index * np.tile(sigma[chosen], count)) ** 2
-            value, cosine = self._factor(cos_, cos_o, length_, tangent, branch)
-            value = weight * value * self._power(j_, self._kappa(cos_, cos_o, length_, branch), branch)
-            parts.append((i_, j_, value, cosine))
-        i, j, value, cosine = (np.concatenate(part) for part in zip(*parts, strict=True))
-        return i, j, value, cosine
+        sigma = np.multiply.outer(length / index, self.widths.astype(length.dtype)[bins])
+        tangent = np.multiply.outer(length**2, (self.q**2).sum(-1).astype(length.dtype)[bins])
+        reach = float(np.sqrt(3)) * sigma
+        far = (rho + reach) ** 2 <= 1 - np.maximum(sigma, MIN_COS_ONE_POINT) ** 2
+        i, j = np.nonzero(~far & (rho - reach < 1))
+        cos_o, r, _ = _above_horizon(rho, sigma, 1)
+        all_i = np.arange(len(cos_i))[:, None]
+        value, cosine = self._at_points(cos_i[:, None], length[:, None], bins, rho, sigma, tangent, cos_o, r, branch)
+        parts = [(all_i, bins, value * far, cosine)]
+        rho, sigma, tangent = (x[i, j] for x in (rho, sigma, tangent))
+        cos_o, r, weight = _above_horizon(rho, sigma, 3)
+        value, cosine = self._at_points(cos_i[i], length[i], bins[j], rho, sigma, tangent, cos_o, r, branch)
+        return [*parts, (np.tile(i, 3), np.tile(bins[j], 3), (value * weight).ravel(), cosine.ravel())]
+
+    def _at_points(
+        self,
+        cos_i: Real,
+        length: Real,
+        bins: Indices,
+        rho: Real,
+        sigma: Real,
+        tangent: Real,
+        cos_o: Real,
+        r: Real,
+        branch: int,
+    ) -> tuple[Real, Real]:
+        """Return the power at points r of bins of width σ about ρ and |λq|² = `tangent`, and |ω_i·h|."""
+        index, square = (branch and self.index) or 1.0, 1 - cos_i**2
+        # |λq|² along the line from the centre of the hemisphere; the component of ω_∥ along it is at most sin θ_i.
+        max_along = 2 * index * np.sqrt(square)
+        along = np.clip((index**2 * rho**2 + square - tangent) / np.maximum(rho, 1e-12), -max_along, max_along)
+        tangent = np.maximum(square + index**2 * r**2 - r * along, 0) + (index * sigma) ** 2
+        value, cosine = self._factor(cos_i, cos_o, length, tangent, branch)
+        value *= self._power(bins, self._kappa(cos_i, cos_o, length, branch), branch)
+        return value, cosine
 
     def _factor(self, cos_i: Real, cos_o: Real, length: Real, tangent: Real, branch: int) -> tuple[Real, Real]:
-        """Return K G with the gain, or K_t G_t, at |λq|² = `tangent`, and |ω_i·h|."""
+        """Return K G with the gain, or K_t G_t, at |λq|² = `tangent`, and |ω_i·h|, (..., n); λ is (n,)."""
         if branch:
             index = self.index or 1.0
             min_v_z = self._min_kappa / max(self.height_scale, 1e-9) * length / (2 * np.pi)
@@ -288,11 +314,15 @@ class Furnace:
         square = tangent + (cos_i + cos_o) ** 2
         value = k_g(cos_i, cos_o, tangent)
         if not self.by_order:
+            # Few bins are so near the mirror direction that b is not zero.
             width = length * self.spectrum.lobe_width
-            b = np.clip((25 - tangent / width**2) / 9, 0, 1) * np.clip(2 - 5 * np.maximum(cos_i, cos_o), 0, 1)
-            mirror = np.flatnonzero(b)
-            gain = [horizon_gain(cos[mirror] ** 2 / (2 * width[mirror])) for cos in (cos_i, cos_o)]
-            value[mirror] += b[mirror] * (gain[0] * gain[1] - value[mirror])
+            mirror = np.nonzero((tangent < 25 * width**2) & (np.maximum(cos_i, cos_o) < 0.4))
+            c_i, c_o, width, distance = (
+                np.broadcast_to(x, value.shape)[mirror] for x in (cos_i, cos_o, width, tangent)
+            )
+            b = np.clip((25 - distance / width**2) / 9, 0, 1) * np.clip(2 - 5 * np.maximum(c_i, c_o), 0, 1)
+            gain = horizon_gain(c_i**2 / (2 * width)) * horizon_gain(c_o**2 / (2 * width))
+            value[mirror] += b * (gain - value[mirror])
         return value, np.sqrt(square) / 2
 
     def _kappa(self, cos_i: Real, cos_o: Real, length: Real, branch: int) -> Real:
@@ -311,10 +341,11 @@ class Furnace:
         flat, start = self.powers.ravel(), component * (last + 1)
 
         def at(kappa: Real | float) -> Real:
-            x = np.minimum(kappa * (last / self.spectrum.max_kappa), last * (1 - 1e-12))
-            interval = np.asarray(x, np.int64)
-            below = flat[start + interval]
-            return below + (x - interval) * (flat[start + interval + 1] - below)
+            x = np.minimum(kappa * (last / self.spectrum.max_kappa), last)
+            interval = np.minimum(np.floor(x), last - 1)
+            index = start + interval.astype(np.int64)
+            below = flat.take(index)
+            return below + (x - interval) * (flat[1:].take(index) - below)
 
         is_forward, kappa = kappa > 0, kappa * self.height_scale
         if not branch:
@@ -396,20 +427,24 @@ def _over_lobe(square: Real, sigma: Real) -> tuple[Real, Real, Real]:
 
 
 def _above_horizon(rho: Real, sigma: Real, count: int) -> tuple[Real, Real, Real]:
-    """Return cos θ_o, r and weight, (count · n,), of points in a bin of width σ whose centre is at r = ρ.
+    """Return cos θ_o, r and weight, (count, ...), of points in a bin of width σ whose centre is at r = ρ.
 
     r² + σ² + cos² θ_o = 1, where σ² is the variance across the radius; weights sum to the fraction of ρ ± √3 σ above
-    the horizon.
+    the horizon. A single point, without a first axis, is for bins that are far above it and has the weight one.
     """
-    low, high = np.maximum(rho - np.sqrt(3) * sigma, 0), rho + np.sqrt(3) * sigma
-    nearest, farthest = (np.sqrt(np.maximum(1 - x**2 - sigma**2, 0)) for x in (low, high))
-    nodes, weights = leggauss(count)
-    cos_o = np.maximum(farthest + (nearest - farthest) * ((1 + nodes) / 2)[:, None], 1e-6)
-    r = np.sqrt(np.maximum(1 - cos_o**2 - sigma**2, 0))
+    reach, square = float(np.sqrt(3)) * sigma, 1 - sigma**2
+    low, high = np.maximum(rho - reach, 0), rho + reach
+    nearest, farthest = (np.sqrt(np.maximum(square - x**2, 0)) for x in (low, high))
+    if count == 1:
+        cos_o = np.maximum((nearest + farthest) / 2, 1e-6)
+        return cos_o, np.sqrt(np.maximum(square - cos_o**2, 0)), np.ones_like(cos_o[:0])
+    nodes, weights = (x.reshape(-1, *np.ones(rho.ndim, int)).astype(rho.dtype) for x in leggauss(count))
+    cos_o = np.maximum(farthest + (nearest - farthest) * ((1 + nodes) / 2), 1e-6)
+    r = np.sqrt(np.maximum(square - cos_o**2, 0))
     # dr = cos θ dcos θ/r
-    weight = weights[:, None] * cos_o / np.maximum(r, 1e-9)
-    above = np.clip((np.sqrt(np.maximum(1 - sigma**2, 0)) - low) / (high - low), 0, 1)
-    return cos_o.ravel(), r.ravel(), (weight * above / weight.sum(0)).ravel()
+    weight = weights * cos_o / np.maximum(r, 1e-9)
+    above = np.clip((np.sqrt(np.maximum(square, 0)) - low) / (high - low), 0, 1)
+    return cos_o, r, weight * (above / weight.sum(0))
 
 
 def _nodes(spectrum: PowerSpectrum) -> Real:

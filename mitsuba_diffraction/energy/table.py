@@ -40,8 +40,10 @@ import base64
 import binascii
 import dataclasses
 import itertools
+import os
 import zlib
 from collections.abc import Mapping, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -284,20 +286,27 @@ def _bounds(
         used = row <= column if mirror == 1 else row + column <= layout.side
     omega, wavelengths = layout.directions(points[used], float(np.mean(layout.frequencies)))
     e = np.ones((len(ratios), sum(len(side.branches[:2]) for side in sides), len(points)))
-    stack = sides[0].stack
-    if stack is None or stack.is_plain:
+    if layout.lines:
         slices = [np.arange(len(omega))]
     else:
         # R and T of films, and the index, depend on the wavelength; there are few wavelengths.
         slices = [np.flatnonzero(wavelengths == wavelength) for wavelength in np.unique(wavelengths)]
     step = (layout.frequencies[1] - layout.frequencies[0]) / (2 * max(layout.slices - 1, 1))
-    for (k, ratio), slice_ in itertools.product(enumerate(ratios), slices):
+
+    def of_slice(ratio: float, slice_: NDArray[np.int64]) -> Real:
         bounds = []
         for side in sides:
             furnace = dataclasses.replace(side, height_scale=ratio).at(wavelengths[slice_[0]], laterals, step)
             length = wavelengths[slice_] * (1.0 if side.side > 0 else furnace.index or 1.0)
             bounds.append(furnace.bounds(omega[slice_], length))
-        e[k, :, np.flatnonzero(used)[slice_]] = np.concatenate(bounds).T
+        return np.concatenate(bounds)
+
+    pairs = list(itertools.product(range(len(ratios)), slices))
+    with ThreadPoolExecutor(os.cpu_count()) as pool:
+        for (k, slice_), bounds in zip(
+            pairs, pool.map(lambda pair: of_slice(ratios[pair[0]], pair[1]), pairs), strict=True
+        ):
+            e[k, :, np.flatnonzero(used)[slice_]] = bounds.T
     if mirror:
         count = len(np.unique(points[:, 1]))
         mirrored = e.reshape(*e.shape[:2], -1, count, count)[..., ::mirror, ::mirror].swapaxes(-1, -2)
