@@ -21,7 +21,7 @@ from scipy.interpolate import RegularGridInterpolator
 from scipy.special import jv
 
 from .errors import RequestError
-from .geometry import Diffracted, diffracted, fresnel
+from .geometry import Diffracted, Orders, diffracted, fresnel
 from .reference import amplitudes
 from .rigorous.coordinate_transformation import curve_of, is_profile
 from .rigorous.rigorous_spectrum import MAX_PERIOD_IN_WAVELENGTHS
@@ -107,26 +107,6 @@ def tile_powers(height_field: HeightField, shortest: float) -> OrderPowers:
         return np.where(inside, np.abs(amplitude) ** 2, 0.0)
 
     return powers
-
-
-@dataclass(frozen=True)
-class Orders:
-    """Efficiencies of the propagating orders of a grating.
-
-    Attributes:
-        m: the orders, (n,), of a tile (n, 2).
-        s, p: fraction of the incident power in each, polarised perpendicular and parallel to the plane of incidence,
-            (n,).
-    """
-
-    m: NDArray[np.int64]
-    s: Array
-    p: Array
-
-    @property
-    def unpolarised(self) -> Array:
-        """The mean of s and p."""
-        return (self.s + self.p) / 2
 
 
 def scalar_orders(
@@ -462,14 +442,17 @@ def _solved_error(profile: HeightField, wavelengths: Sequence[float]) -> tuple[f
             exact = converge(curve, omega_i, period / wavelength, INDEX, _MAX_SOLVER_ERROR)
             if not exact.error <= _MAX_SOLVER_ERROR:
                 return float("nan"), float("nan")
-            scalar = scalar_orders(powers, period, wavelength, angle, INDEX)
-            scalar_transmitted = transmitted_orders(powers, period, wavelength, angle, INDEX)
-            wanted = (exact.orders, exact.unpolarised), (exact.transmitted_orders, exact.transmitted_unpolarised)
+            pairs = (
+                (scalar_orders(powers, period, wavelength, angle, INDEX), exact.reflection),
+                (transmitted_orders(powers, period, wavelength, angle, INDEX), exact.transmission),
+            )
             # Only one of the theories may include an order exactly at the horizon, which has no power.
             errors.append(
                 [
-                    efficiency_difference(found.unpolarised[np.isin(found.m, m)], eta[np.isin(m, found.m)])
-                    for found, (m, eta) in zip((scalar, scalar_transmitted), wanted, strict=True)
+                    efficiency_difference(
+                        one.unpolarised[np.isin(one.m, two.m)], two.unpolarised[np.isin(two.m, one.m)]
+                    )
+                    for one, two in pairs
                 ]
             )
     reflected, transmitted_ = np.mean(errors, axis=0)
