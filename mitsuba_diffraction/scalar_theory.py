@@ -411,7 +411,8 @@ def scalar_waves(height_field: HeightField, extent: str = "tile", light: tuple[f
     # Deeper profiles take long to solve, and are far outside the range.
     if waves.depth > wavelengths[0]:
         return waves
-    solved = _solved_error(height_field, wavelengths) if waves.depth > 0 else (0.0, 0.0)
+    row = tuple(height_field.heights[0].tolist())
+    solved = _solved_error(row, height_field.pixel_size, wavelengths, ERROR_ANGLES) if waves.depth > 0 else (0.0, 0.0)
     if not np.isfinite(solved[0]):
         return waves
     return replace(waves, solved=ScalarError(*solved, False, waves.error(light).remedy, wavelengths))
@@ -430,14 +431,22 @@ def scalar_error(height_field: HeightField, extent: str = "tile", light: tuple[f
     return scalar_waves(height_field, extent, light).error(light)
 
 
-def _solved_error(profile: HeightField, wavelengths: Sequence[float]) -> tuple[float, float]:
-    """Compute the mean error of reflected and of transmitted light; NaN if the solver does not converge."""
-    period = profile.tile_size[0]
-    row = HeightField(profile.heights[:1], profile.pixel_size)
-    powers, curve = profile_powers(row), curve_of(row)
+@functools.lru_cache(maxsize=64)
+def _solved_error(
+    heights: tuple[float, ...],
+    pixel_size: tuple[float, float],
+    wavelengths: tuple[float, ...],
+    angles: tuple[float, ...],
+) -> tuple[float, float]:
+    """Compute the mean error of reflected and of transmitted light; NaN if the solver does not converge.
+
+    One profile has several spectra, such as those of a study of convergence.
+    """
+    profile = HeightField(np.array([heights]), pixel_size)
+    period, powers, curve = profile.tile_size[0], profile_powers(profile), curve_of(profile)
     errors = []
     for wavelength in wavelengths:
-        for angle in ERROR_ANGLES:
+        for angle in angles:
             omega_i = np.array([-np.sin(np.deg2rad(angle)), 0.0, np.cos(np.deg2rad(angle))])
             exact = converge(curve, omega_i, period / wavelength, INDEX, _MAX_SOLVER_ERROR)
             if not exact.error <= _MAX_SOLVER_ERROR:
