@@ -83,6 +83,26 @@ def _ordered(a: Array, b: Array, select: Callable[..., Any]) -> tuple[Array, Arr
 
 
 @dataclass(frozen=True, eq=False)
+class Orders:
+    """Efficiencies of the propagating orders of a grating, reflected or transmitted, for light of one ω_i.
+
+    Attributes:
+        m: the orders, (n,), of a tile (n, 2).
+        s, p: fraction of the incident power in each, for light polarised perpendicular and parallel to the plane of
+            incidence, (n,).
+    """
+
+    m: NDArray[np.int64]
+    s: NDArray[np.float64]
+    p: NDArray[np.float64]
+
+    @property
+    def unpolarised(self) -> NDArray[np.float64]:
+        """The mean of s and p."""
+        return (self.s + self.p) / 2
+
+
+@dataclass(frozen=True, eq=False)
 class Diffracted:
     """The directions ω_o into which light of one ω_i is diffracted, (n,), in NumPy.
 

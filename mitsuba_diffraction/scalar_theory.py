@@ -21,7 +21,7 @@ from scipy.interpolate import RegularGridInterpolator
 from scipy.special import jv
 
 from .errors import RequestError
-from .geometry import Diffracted, diffracted, fresnel
+from .geometry import Diffracted, Orders, diffracted, fresnel
 from .reference import amplitudes
 from .rigorous.coordinate_transformation import curve_of, is_profile
 from .rigorous.rigorous_spectrum import MAX_PERIOD_IN_WAVELENGTHS
@@ -107,26 +107,6 @@ def tile_powers(height_field: HeightField, shortest: float) -> OrderPowers:
         return np.where(inside, np.abs(amplitude) ** 2, 0.0)
 
     return powers
-
-
-@dataclass(frozen=True)
-class Orders:
-    """Efficiencies of the propagating orders of a grating.
-
-    Attributes:
-        m: the orders, (n,), of a tile (n, 2).
-        s, p: fraction of the incident power in each, polarised perpendicular and parallel to the plane of incidence,
-            (n,).
-    """
-
-    m: NDArray[np.int64]
-    s: Array
-    p: Array
-
-    @property
-    def unpolarised(self) -> Array:
-        """The mean of s and p."""
-        return (self.s + self.p) / 2
 
 
 def scalar_orders(
@@ -431,7 +411,8 @@ def scalar_waves(height_field: HeightField, extent: str = "tile", light: tuple[f
     # Deeper profiles take long to solve, and are far outside the range.
     if waves.depth > wavelengths[0]:
         return waves
-    solved = _solved_error(height_field, wavelengths) if waves.depth > 0 else (0.0, 0.0)
+    row = tuple(height_field.heights[0].tolist())
+    solved = _solved_error(row, height_field.pixel_size, wavelengths, ERROR_ANGLES) if waves.depth > 0 else (0.0, 0.0)
     if not np.isfinite(solved[0]):
         return waves
     return replace(waves, solved=ScalarError(*solved, False, waves.error(light).remedy, wavelengths))
@@ -450,26 +431,37 @@ def scalar_error(height_field: HeightField, extent: str = "tile", light: tuple[f
     return scalar_waves(height_field, extent, light).error(light)
 
 
-def _solved_error(profile: HeightField, wavelengths: Sequence[float]) -> tuple[float, float]:
-    """Compute the mean error of reflected and of transmitted light; NaN if the solver does not converge."""
-    period = profile.tile_size[0]
-    row = HeightField(profile.heights[:1], profile.pixel_size)
-    powers, curve = profile_powers(row), curve_of(row)
+@functools.lru_cache(maxsize=64)
+def _solved_error(
+    heights: tuple[float, ...],
+    pixel_size: tuple[float, float],
+    wavelengths: tuple[float, ...],
+    angles: tuple[float, ...],
+) -> tuple[float, float]:
+    """Compute the mean error of reflected and of transmitted light; NaN if the solver does not converge.
+
+    One profile has several spectra, such as those of a study of convergence.
+    """
+    profile = HeightField(np.array([heights]), pixel_size)
+    period, powers, curve = profile.tile_size[0], profile_powers(profile), curve_of(profile)
     errors = []
     for wavelength in wavelengths:
-        for angle in ERROR_ANGLES:
+        for angle in angles:
             omega_i = np.array([-np.sin(np.deg2rad(angle)), 0.0, np.cos(np.deg2rad(angle))])
             exact = converge(curve, omega_i, period / wavelength, INDEX, _MAX_SOLVER_ERROR)
             if not exact.error <= _MAX_SOLVER_ERROR:
                 return float("nan"), float("nan")
-            scalar = scalar_orders(powers, period, wavelength, angle, INDEX)
-            scalar_transmitted = transmitted_orders(powers, period, wavelength, angle, INDEX)
-            wanted = (exact.orders, exact.unpolarised), (exact.transmitted_orders, exact.transmitted_unpolarised)
+            pairs = (
+                (scalar_orders(powers, period, wavelength, angle, INDEX), exact.reflection),
+                (transmitted_orders(powers, period, wavelength, angle, INDEX), exact.transmission),
+            )
             # Only one of the theories may include an order exactly at the horizon, which has no power.
             errors.append(
                 [
-                    efficiency_difference(found.unpolarised[np.isin(found.m, m)], eta[np.isin(m, found.m)])
-                    for found, (m, eta) in zip((scalar, scalar_transmitted), wanted, strict=True)
+                    efficiency_difference(
+                        one.unpolarised[np.isin(one.m, two.m)], two.unpolarised[np.isin(two.m, one.m)]
+                    )
+                    for one, two in pairs
                 ]
             )
     reflected, transmitted_ = np.mean(errors, axis=0)

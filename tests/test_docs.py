@@ -6,6 +6,7 @@ import inspect
 import logging
 import pkgutil
 import re
+import runpy
 import shlex
 import shutil
 from pathlib import Path
@@ -176,23 +177,15 @@ def test_a_wrong_block_of_code_is_found(folder, command, llvm, capfd):
         run_toml("[surfaces]")
 
 
-def test_the_manual_lists_the_parameters_of_the_plugins(llvm):
-    from mitsuba_diffraction.bsdf import diffraction_grating
-    from mitsuba_diffraction.evaluation.realtime_shader import diffraction_shader
-    from mitsuba_diffraction.integrator import diffraction_path
-
-    text, listed, head = (ROOT / "docs" / "plugin.md").read_text().replace("`", ""), set(), []
-    for line in text.splitlines():
-        cells = [cell.strip() for cell in line.strip("| ").split(" | ")] if line.startswith("| ") else []
-        if not line.startswith("|"):
-            head = []
-        if cells[:1] == ["parameter"]:
-            head = cells
-        elif cells and head:
-            row = dict(zip(head, cells, strict=False))
-            listed.add((row["parameter"], row["type"], row.get("default", "").strip("| ")))
-    known = (*diffraction_grating.PARAMETERS, *diffraction_shader.PARAMETERS, *diffraction_path.PARAMETERS)
-    assert listed == {(parameter.name, parameter.type, parameter.default) for parameter in known}
+def test_the_tables_of_the_manual_are_those_of_the_plugins(llvm):
+    """If they are not: python tools/manual/parameter_tables.py."""
+    with_tables = runpy.run_path(str(ROOT / "tools" / "manual" / "parameter_tables.py"))["with_tables"]
+    text = (ROOT / "docs" / "plugin.md").read_text(encoding="utf-8")
+    assert with_tables(text) == text
+    with pytest.raises(KeyError, match="'material_'"):
+        with_tables(text.replace("| `material` |", "| `material_` |"))
+    with pytest.raises(ValueError, match="no row for material"):
+        with_tables(re.sub(r"^\| `material` \|.*\n", "", text, flags=re.MULTILINE))
 
 
 def test_the_manual_lists_what_rigorous_theory_refuses():

@@ -14,6 +14,7 @@ from numpy.typing import ArrayLike, NDArray
 from threadpoolctl import ThreadpoolController
 
 from ..errors import RequestError
+from ..geometry import Orders
 from ..materials import refractive_index
 from ..surface.heightfield import HeightField
 from .coordinate_transformation import ABOVE, BELOW, Curve, CurveMatrices, Scattered, curve_of, half_space, scatter
@@ -107,24 +108,34 @@ class Efficiencies:
     error: float
 
     @property
+    def reflection(self) -> Orders:
+        """η_m of `orders`."""
+        return Orders(self.orders, *_powers(self.amplitudes).T)
+
+    @property
+    def transmission(self) -> Orders:
+        """The efficiencies of `transmitted_orders`."""
+        return Orders(self.transmitted_orders, *_powers(self.transmitted_amplitudes).T)
+
+    @property
     def s(self) -> Real:
         """η_m of s-polarised incident light, (n,)."""
-        return _powers(self.amplitudes)[:, 0]
+        return self.reflection.s
 
     @property
     def p(self) -> Real:
         """η_m of p-polarised incident light, (n,)."""
-        return _powers(self.amplitudes)[:, 1]
+        return self.reflection.p
 
     @property
     def unpolarised(self) -> Real:
         """η_m of unpolarised light, the mean of both, (n,)."""
-        return (self.s + self.p) / 2
+        return self.reflection.unpolarised
 
     @property
     def transmitted_unpolarised(self) -> Real:
         """The efficiencies of `transmitted_orders` for unpolarised light, (k,)."""
-        return _powers(self.transmitted_amplitudes).mean(axis=1)
+        return self.transmission.unpolarised
 
     @property
     def imbalance(self) -> float:
@@ -137,12 +148,8 @@ class Efficiencies:
     def __str__(self) -> str:
         """Return a table of all orders."""
         lines = [f"{'order':>17}{'s':>9}{'p':>9}{'unpolarised':>14}    % of the incident light"]
-        sides = (
-            ("reflected", self.orders, self.amplitudes),
-            ("transmitted", self.transmitted_orders, self.transmitted_amplitudes),
-        )
-        for name, orders, amplitudes in sides:
-            for m, (s, p) in zip(orders, 100 * _powers(amplitudes), strict=True):
+        for name, orders in (("reflected", self.reflection), ("transmitted", self.transmission)):
+            for m, s, p in zip(orders.m, 100 * orders.s, 100 * orders.p, strict=True):
                 lines.append(f"{name:<11}{m:>6d}{s:>9.3f}{p:>9.3f}{(s + p) / 2:>14.3f}")
         return "\n".join([*lines, f"error {self.error:.1e}, {self.harmonics} harmonics"])
 
@@ -281,8 +288,8 @@ def scattered(curve: Curve, omega: Real, k_0: float, index: complex, harmonics: 
     return scatter(alpha + grating.n, above, half_space(grating, alpha, square, False), k_y, index)
 
 
-def sheet_orders(curve: Curve, omega: Real, k_0: float, index: float, harmonics: int) -> tuple[NDArray[np.int64], Real]:
-    """Return the orders transmitted by a sheet, ascending, and η_m of s and of p light, (n, 2).
+def sheet_orders(curve: Curve, omega: Real, k_0: float, index: float, harmonics: int) -> Orders:
+    """Return the orders transmitted by a sheet, ascending.
 
     For arguments see `solve`; light is incident from above.
     """
@@ -290,7 +297,7 @@ def sheet_orders(curve: Curve, omega: Real, k_0: float, index: float, harmonics:
     matrices = through_sheet(solved, index)[ABOVE, BELOW][:, list(solved.orders[ABOVE]).index(0), 0].real
     frame = frames(-omega[None])[0]
     stokes = np.einsum("as,iab,bs->is", frame, _PAULI, frame).real
-    return -solved.orders[ABOVE][::-1], (matrices @ stokes)[::-1]
+    return Orders(-solved.orders[ABOVE][::-1], *(matrices @ stokes)[::-1].T)
 
 
 def _powers(amplitudes: Complex) -> Real:

@@ -55,13 +55,13 @@ def solved(job: tuple[str, tuple[int, int], float, float]) -> tuple[float, float
     found = rigorous.efficiencies(surface, light, 1.0, int_ior=index, tolerance=TOLERANCE)
     if transmits:
         scalar = transmitted_orders(sinusoid_powers(depth), period, 1.0, angle, index.real, azimuth, below)
-        wanted, exact = found.transmitted_orders, found.transmitted_unpolarised
+        exact = found.transmission
     else:
         scalar = scalar_orders(sinusoid_powers(depth), period, 1.0, angle, index, azimuth)
-        wanted, exact = found.orders, found.unpolarised
-    if not np.array_equal(wanted, scalar.m):
-        raise RuntimeError(f"{job}: got the orders {scalar.m}, wanted {wanted}")
-    return efficiency_difference(scalar.unpolarised, exact), found.error
+        exact = found.reflection
+    if not np.array_equal(exact.m, scalar.m):
+        raise RuntimeError(f"{job}: got the orders {scalar.m}, wanted {exact.m}")
+    return efficiency_difference(scalar.unpolarised, exact.unpolarised), found.error
 
 
 def make(path: Path) -> None:

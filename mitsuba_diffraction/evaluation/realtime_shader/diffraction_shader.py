@@ -27,21 +27,30 @@ PUBLISHED_BRIGHTNESS = 1000.0
 """Every variant of the published program has it, unless its slider is moved (github.com/simplay/Bachelor-Thesis)."""
 
 PARAMETERS = (
-    Parameter("variant", "string", "flss, nmm, pq, nmm_pq or gem", "flss"),
+    Parameter("variant", "string", "`flss`, `nmm`, `pq`, `nmm_pq` or `gem`", "flss"),
     Parameter("as_published", "boolean", "with all quirks of the published shader, or with none", "true"),
-    Parameter("schlick, relative, …", "boolean", "overrides as_published for one quirk; `Quirks` lists them"),
+    Parameter(
+        "schlick, relative, …",
+        "boolean",
+        "overrides `as_published` for one quirk; `realtime_shader.quirks.Quirks` lists them",
+    ),
     Parameter(
         "brightness",
         "float",
-        "the slider of the published program, a factor of the diffraction alone; 0 is its default. pq halves it, gem "
-        "divides it by 4000; radiance that is not relative has none",
+        "the slider of the published program, a factor of the diffraction alone; 0 is its default. `pq` and `nmm_pq` "
+        "halve it, `gem` divides it by 4000; radiance that is not relative has none",
         "1000",
     ),
-    Parameter("terms", "integer", "Taylor terms; default: as published; corrected, as many as needed; not for gem"),
-    Parameter("window", "string", "texel or 4sigma; overrides one_texel; for flss and nmm only"),
-    Parameter("interpolation", "string", "sinc or linear; for pq and nmm_pq only", "sinc"),
-    Parameter("spacing", "float", "period, µm; default: that of the strongest Fourier component along x; for gem only"),
-    Parameter("roughness", "float", "width of the highlight, 1/µm; for gem only", "5"),
+    Parameter(
+        "terms",
+        "integer",
+        "Taylor terms; default: 37 (`nmm` 31, `pq` 39) as published; corrected, as many as an error of 1e-4 requires; "
+        "not for `gem`",
+    ),
+    Parameter("window", "string", "`texel` or `4sigma`; overrides `one_texel`; for `flss` and `nmm` only"),
+    Parameter("interpolation", "string", "`sinc` or `linear`; for `pq` and `nmm_pq` only", "sinc"),
+    Parameter("spacing", "float", "period, µm; default: of the strongest Fourier component along x; for `gem` only"),
+    Parameter("roughness", "float", "width of the highlight, 1/µm; for `gem` only", "5"),
     Parameter("shadows", "boolean", "cast shadow rays", "false"),
     Parameter("diffuse_weight", "float", "weight of a BSDF below the grating; the thesis gives no number", "0.5"),
 )

@@ -21,8 +21,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from ...geometry import Orders
 from ...scalar_theory import (
-    Orders,
     efficiency_difference,
     error_map,
     expected_error,

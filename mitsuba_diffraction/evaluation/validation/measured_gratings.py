@@ -65,13 +65,11 @@ def littrow(name: str, facet_angle: float, wavelengths: Real, rigorous: bool) ->
         if rigorous:
             harmonics = int(1.5 * period / wavelength) + 10
             direction = -sine, 0.0, np.sqrt(1 - sine**2)
-            exact = efficiencies(surface, direction, wavelength, int_ior=index, harmonics=harmonics)
-            orders, powers = exact.orders, exact.unpolarised
+            orders = efficiencies(surface, direction, wavelength, int_ior=index, harmonics=harmonics).reflection
         else:
             angle = float(np.rad2deg(np.arcsin(sine)))
-            scalar = scalar_orders(profile_powers(surface), period, wavelength, angle, index)
-            orders, powers = scalar.m, scalar.unpolarised
-        found.append(powers[orders == 1][0])
+            orders = scalar_orders(profile_powers(surface), period, wavelength, angle, index)
+        found.append(orders.unpolarised[orders.m == 1][0])
     return np.array(found)
 
 

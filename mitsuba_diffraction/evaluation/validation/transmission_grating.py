@@ -52,12 +52,11 @@ def transmitted(surface: HeightField, wavelength: float, rigorous: bool) -> Real
         # Fifteen harmonics more change the efficiencies by less than 1e-3.
         harmonics = int(2 * index * T300_PERIOD / wavelength) + 15
         exact = efficiencies(surface, (0, 0, -1), wavelength, int_ior=index, tolerance=0.02, harmonics=harmonics)
-        orders, powers = exact.transmitted_orders, exact.transmitted_unpolarised
+        orders = exact.transmission
     else:
-        scalar = transmitted_orders(profile_powers(surface), T300_PERIOD, wavelength, 0.0, index, from_below=True)
-        orders, powers = scalar.m, scalar.unpolarised
+        orders = transmitted_orders(profile_powers(surface), T300_PERIOD, wavelength, 0.0, index, from_below=True)
     face = 1 - fresnel(1.0, index)[0]
-    return face * np.array([powers[orders == -m][0] for m in (1, 2)])
+    return face * np.array([orders.unpolarised[orders.m == -m][0] for m in (1, 2)])
 
 
 @functools.cache
