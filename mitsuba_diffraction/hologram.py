@@ -28,7 +28,7 @@ from .outputs import MARK
 
 PERIOD, DEPTH = 1.5, 0.25  # µm, as in hologram.xml
 SIZE = 16.0, 9.0  # cm, of the hologram
-WAVELENGTHS = np.array([0.620, 0.535, 0.460])  # µm, of the stripes
+STRIPE_WAVELENGTHS = np.array([0.620, 0.535, 0.460])  # µm, of the stripes
 BAND = 0.06  # relative width of the band of wavelengths that reaches the eye, by the width of the lamp
 LIGHT, EYE = (-12.0, 22.0, 52.0), (0.0, -44.0, 44.0)  # of hologram.xml
 WHITE_QUANTILE = 0.995  # of the stripes' brightness, shown with the maximum efficiency of a grating
@@ -39,7 +39,7 @@ Array = NDArray[np.float64]
 def stripe_brightness(linear: Array) -> Array:
     """Return the brightness of the three stripes, from 0 to 1, for linear sRGB (rows, columns, 3)."""
     wavelengths = np.arange(380, 781) * 1e-3
-    bands = np.exp(-0.5 * ((wavelengths[:, None] / WAVELENGTHS - 1) / BAND) ** 2)
+    bands = np.exp(-0.5 * ((wavelengths[:, None] / STRIPE_WAVELENGTHS - 1) / BAND) ** 2)
     stripes = np.maximum(linear @ np.linalg.inv(spectrum_to_linear_sRGB(bands.T, 1e3 * wavelengths)), 0)
     return np.minimum(stripes / max(np.quantile(stripes.max(-1), WHITE_QUANTILE), 1e-3), 1)
 
@@ -61,7 +61,7 @@ def stripes(brightness: Array) -> tuple[Array, Array, Array]:
     x, y = (np.arange(columns) + 0.5) * pixel - SIZE[0] / 2, (rows / 2 - np.arange(rows) - 0.5) * 3 * pixel
     points = np.stack([*np.meshgrid(x, y), np.zeros((rows, columns))], -1)
     cosines = -directions(points, np.array(LIGHT)) - directions(points, np.array(EYE))
-    wavelength = np.tile(WAVELENGTHS, columns // 3)
+    wavelength = np.tile(STRIPE_WAVELENGTHS, columns // 3)
     lateral = wavelength / np.hypot(cosines[..., 0], cosines[..., 1]) / PERIOD
     # J_1(x)² up to its maximum; for Al without a coat, the other factors hardly depend on the wavelength.
     x = np.linspace(0, jnp_zeros(1, 1)[0], 500)
