@@ -57,7 +57,7 @@ def k_g(
         select: `numpy.where` or `drjit.select`.
     """
 
-    def either(reflected: Callable[[], Array], transmitted: Callable[[], Array]) -> Array:
+    def either(reflected: Callable[[], AnyArray], transmitted: Callable[[], AnyArray]) -> AnyArray:
         if isinstance(reflects, bool):
             return reflected() if reflects else transmitted()
         return select(reflects, reflected(), transmitted())
@@ -75,7 +75,7 @@ def k_g(
     return either(lambda: result, lambda: select(square < abs(excess), result, 0))
 
 
-def _ordered(a: Array, b: Array, select: Callable[..., Any]) -> tuple[Array, Array]:
+def _ordered(a: AnyArray, b: AnyArray, select: Callable[..., Any]) -> tuple[AnyArray, AnyArray]:
     """Return the minimum and the maximum, element by element."""
     if select is np.where:  # which is slow
         return np.minimum(a, b), np.maximum(a, b)

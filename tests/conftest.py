@@ -166,6 +166,7 @@ def command(monkeypatch, capfd):
         monkeypatch.setattr(sys, "argv", [cli.NAME, *arguments])
         # On a slow machine a command says how far it is.
         monkeypatch.setattr(progress, "log_lines", lambda *label: lambda *done: None)
+        monkeypatch.setattr(progress, "_say_stage", lambda *label: None)
         # Warnings are shown, as they are to a person, and what shows them is put back afterwards.
         with warnings.catch_warnings():
             warnings.simplefilter("default")

@@ -170,7 +170,7 @@ def test_stripes_of_the_hologram_diffract_their_colours_from_the_lamp_to_the_eye
     y, x = np.mgrid[:4, :18]
     points = np.stack([(x + 0.5) * pixel - 8, (1.5 - y) * 3 * pixel, 0 * x], -1).reshape(-1, 3)
     to_light, to_eye = (gratings_of.directions(points, there) for there in (light, eye))
-    turn, wavelength = np.deg2rad(turn), np.tile(gratings_of.WAVELENGTHS, 24)
+    turn, wavelength = np.deg2rad(turn), np.tile(gratings_of.STRIPE_WAVELENGTHS, 24)
     diffracted = (wavelength / (lateral * gratings_of.PERIOD))[:, None] * np.stack([np.cos(turn), np.sin(turn)], -1)
     np.testing.assert_allclose(-to_light[:, :2] - diffracted, to_eye[:, :2], atol=1e-12)
     kappa = 2 * np.pi * (to_light[:, 2] + to_eye[:, 2]) / wavelength

@@ -13,7 +13,7 @@ import typer
 
 from ..errors import RequestError
 from ..outputs import check_outputs, free_name
-from ..progress import durations, progress_bar, say, stage, tell
+from ..progress import bytes_text, durations, progress_bar, say, stage, tell
 from .arguments import Define, Overwrite, Variant, check_suffix, materials_of, scene_parameters
 
 if TYPE_CHECKING:
@@ -178,12 +178,12 @@ def _announce(
         return
     planes += estimate.channels if wavelengths is None else wavelengths
     size = bytes_per_number * planes * estimate.columns * estimate.rows
-    disk = f", {estimate.disk / 1e9:.2g} GB of disk meanwhile" if estimate.disk else ""
+    disk = f", {bytes_text(estimate.disk)} of disk meanwhile" if estimate.disk else ""
     say(
         label,
         f"{estimate.columns} × {estimate.rows} pixels, {estimate.spp} samples per pixel: about "
-        f"{estimate.seconds / 60:.0f} min, {estimate.memory / 1e9:.2g} GB of memory{disk}, a picture of "
-        f"{size / 1e6:.2g} MB before compression",
+        f"{estimate.seconds / 60:.0f} min, {bytes_text(estimate.memory)} of memory{disk}, a picture of "
+        f"{bytes_text(size)} before compression",
     )
     if named is not None and estimate.seconds > _HOUR:
         _log.warning(
@@ -328,10 +328,12 @@ def _picture(
             image.shape[2] if stored["channels"] is None else wider_hats(image.shape[2], stored["channels"]).shape[1]
         )
         channels = "RGB" if stored["rgb"] else f"{count} wavelengths"
-    exposed = f"exposed by {(stops := math.log2(exposure)):+.2f} stops (--exposure {stops:.2f})"
+    exposed = (
+        "denoised, " if denoise else ""
+    ) + f"exposed by {(stops := math.log2(exposure)):+.2f} stops (--exposure {stops:.2f})"
     tell(
         f"{path}: {_summary(image, request['until_error'], channels)}, "
-        f"{time.perf_counter() - start:.1f} s, {path.stat().st_size / 1e6:.3g} MB"
+        f"{time.perf_counter() - start:.1f} s, {bytes_text(path.stat().st_size)}"
         + (f"\n{preview}: preview, {exposed}" if _is_spectral(path) else f", {exposed}")
     )
     return exposure

@@ -25,6 +25,7 @@ from numpy.typing import NDArray
 
 from ..errors import RequestError, root_cause
 from ..integrator.paths import LightPaths, random_numbers, unpacked
+from ..progress import bytes_text
 from .scene import channel_wavelengths, channel_weights, no_warnings, recorded_range, recorded_wavelengths
 
 Rows = tuple[int, int]
@@ -131,8 +132,8 @@ def check_memory(scene: mi.Scene, spp: int, bands: tuple[Rows, ...] | None = Non
     dr.flush_malloc_cache()
     if (available := _available_memory()) is not None and needed > available:
         raise RequestError(
-            f"film: got {columns} × {rows} pixels, which take {needed / 1e9:.3g} GB of memory, wanted at most the "
-            f"{available / 1e9:.3g} GB that are available"
+            f"film: got {columns} × {rows} pixels, which take {bytes_text(needed)} of memory, wanted at most the "
+            f"{bytes_text(available)} that are available"
         )
     return needed
 

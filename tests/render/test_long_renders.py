@@ -472,8 +472,8 @@ def test_the_command_announces_long_renderings_and_takes_an_exposure(command, mo
     monkeypatch.setattr(module, "_MIN_ANNOUNCED_SECONDS", 0)
     code, out, err = command(f"{RENDER} -o out.exr --spp 4")
     assert code == 0
-    assert "16 × 16 pixels, 4 samples per pixel: about 0 min, 0.00022 GB of memory" in err
-    assert "a picture of 0.049 MB before compression" in err
+    assert "16 × 16 pixels, 4 samples per pixel: about 0 min, 224 kB of memory" in err
+    assert "a picture of 49 kB before compression" in err
     assert len(err.splitlines()) == 1
     assert re.search(r"exposed by \+?(-?\d+\.\d\d) stops \(--exposure \1\)", out)
     monkeypatch.setattr(module, "_HOUR", 1e-9)
