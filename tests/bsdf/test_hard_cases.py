@@ -47,7 +47,7 @@ SHALLOW = {
     "rectangular pixels of a tile": (field_of(noise((7, 6), 0.2), (0.08, 0.05)), "tile", 65.0),
     "rectangular pixels of a sample": (field_of(noise((20, 14), 0.2), (0.08, 0.05)), "sample", 0.45),
     "coherent over less than a period": (field_of(noise((1, 31), 0.2)), "tile", 0.6),
-    "coherent over less than a pixel": (field_of(noise((5, 5), 0.2)), "tile", 0.04),
+    "coherent over one wavelength": (field_of(noise((5, 5), 0.2)), "tile", 0.38),
     "coherent over far more than the tile": (field_of(noise((5, 7), 0.2)), "tile", 1000.0),
     "one order": (field_of(noise((3, 2), 0.2), (0.04, 0.05)), "tile", 65.0),
     "one pixel": (field_of([[3.0]]), "tile", 65.0),
