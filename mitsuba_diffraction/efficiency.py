@@ -14,11 +14,12 @@ from numpy.typing import ArrayLike, NDArray
 from . import rigorous
 from .errors import RequestError, is_number
 from .files import whole_file
+from .geometry import Orders
 from .materials import RefractiveIndex, index_of, refractive_index
 from .outputs import MARK, METADATA
 from .progress import Progress, silent
 from .rigorous.coordinate_transformation import curve_of, is_profile
-from .rigorous.efficiencies import sheet_orders
+from .rigorous.solver import sheet_orders
 from .scalar_theory import incident_direction, profile_powers, scalar_orders, tile_powers, transmitted_orders
 from .settings import THEORIES, TRANSMISSIONS
 from .surface.heightfield import HeightField
@@ -225,8 +226,8 @@ def efficiencies(
     """
     if not isinstance(height_field, HeightField):
         raise RequestError(f"height_field: got {type(height_field).__name__}, wanted a HeightField")
-    angles = numbers("angles", angles, "degrees above −90 and below 90", -90.0, 90.0)
-    wavelengths = numbers("wavelengths", wavelengths, "nm from 10 to 100000 (100 µm)", 9.999, 100_000.001)
+    angles = checked_numbers("angles", angles, "degrees above −90 and below 90", -90.0, 90.0)
+    wavelengths = checked_numbers("wavelengths", wavelengths, "nm from 10 to 100000 (100 µm)", 9.999, 100_000.001)
     if theory not in THEORIES:
         raise RequestError(f"theory: got {theory!r}, wanted one of {', '.join(THEORIES)}")
     if not is_number(azimuth) or not np.isfinite(azimuth):
@@ -247,14 +248,15 @@ def efficiencies(
     for step, (a, w) in enumerate(np.ndindex(len(angles), len(wavelengths)), 1):
         wavelength = float(wavelengths[w]) * 1e-3
         index = index_at(wavelength, material, int_ior, theory)
-        for m, *pair in zip(*solve(float(angles[a]), wavelength, index), strict=True):
+        orders = solve(float(angles[a]), wavelength, index)
+        for m, *pair in zip(orders.m, orders.s, orders.p, strict=True):
             of_order = found.setdefault(tuple(np.atleast_1d(m).tolist()), np.zeros((len(angles), len(wavelengths), 2)))
             of_order[a, w] = pair
         progress(step, len(angles) * len(wavelengths))
-    orders = sorted(found)
+    all_orders = sorted(found)
     return OrderEfficiencies(
-        np.stack([found[m] for m in orders]),
-        np.array(orders)[:, 0] if profile else np.array(orders),
+        np.stack([found[m] for m in all_orders]),
+        np.array(all_orders)[:, 0] if profile else np.array(all_orders),
         angles,
         wavelengths,
         description(height_field.source, material, int_ior, azimuth, theory, transmission),
@@ -289,10 +291,8 @@ def index_at(wavelength: float, material: str | None, int_ior: complex | str | N
     return refractive_index(wavelength, int_ior=int_ior, material=material, known=True)
 
 
-_Found = tuple[NDArray[np.int64], Array, Array]
-"""Orders, their efficiencies of s- and of p-polarised light."""
-_Solve = Callable[[float, float, complex], _Found]
-"""(angle in degrees, wavelength in µm, index) → orders and efficiencies."""
+_Solve = Callable[[float, float, complex], Orders]
+"""(angle in degrees, wavelength in µm, index) → efficiencies."""
 
 
 def _scalar(height_field: HeightField, azimuth: float, shortest: float, transmission: str) -> _Solve:
@@ -306,33 +306,28 @@ def _scalar(height_field: HeightField, azimuth: float, shortest: float, transmis
     powers = profile_powers(height_field) if profile else tile_powers(height_field, shortest)
     period = x if profile else (x, y)
 
-    def solve(angle: float, wavelength: float, index: complex) -> _Found:
+    def solve(angle: float, wavelength: float, index: complex) -> Orders:
         if transmission == "none":
-            found = scalar_orders(powers, period, wavelength, angle, index, azimuth)
-        else:
-            is_sheet = transmission == "sheet"
-            found = transmitted_orders(powers, period, wavelength, angle, index.real, azimuth, sheet=is_sheet)
-        return found.m, found.s, found.p
+            return scalar_orders(powers, period, wavelength, angle, index, azimuth)
+        is_sheet = transmission == "sheet"
+        return transmitted_orders(powers, period, wavelength, angle, index.real, azimuth, sheet=is_sheet)
 
     return solve
 
 
 def _rigorous(height_field: HeightField, azimuth: float, shortest: float, transmission: str) -> _Solve:
-    def solve(angle: float, wavelength: float, index: complex) -> _Found:
+    def solve(angle: float, wavelength: float, index: complex) -> Orders:
         direction = incident_direction(angle, azimuth)
         found = rigorous.efficiencies(height_field, direction, wavelength, int_ior=index)
-        if transmission == "none":
-            return found.orders, found.s, found.p
-        if transmission == "interface":
-            return found.transmitted_orders, *(np.abs(found.transmitted_amplitudes) ** 2).sum(axis=1).T
+        if transmission != "sheet":
+            return found.reflection if transmission == "none" else found.transmission
         k_0 = height_field.tile_size[0] / wavelength
-        orders, powers = sheet_orders(curve_of(height_field), direction, k_0, index.real, found.harmonics)
-        return orders, *powers.T
+        return sheet_orders(curve_of(height_field), direction, k_0, index.real, found.harmonics)
 
     return solve
 
 
-def numbers(name: str, values: ArrayLike, wanted: str, low: float, high: float) -> Array:
+def checked_numbers(name: str, values: ArrayLike, wanted: str, low: float, high: float) -> Array:
     """Return one number or several, all above `low` and below `high`, as (n,)."""
     try:
         array = np.atleast_1d(np.asarray(values, np.float64))

@@ -5,6 +5,8 @@ from __future__ import annotations
 import builtins
 import re
 import sys
+from collections.abc import Iterable
+from difflib import get_close_matches
 from numbers import Integral, Real
 from typing import Any
 
@@ -47,6 +49,12 @@ def check_whole(name: str, value: Any, minimum: int, maximum: int | None = None)
     if not (whole and value >= minimum and (maximum is None or value <= maximum)):
         wanted = f"of at least {minimum}" if maximum is None else f"from {minimum} to {maximum}"
         raise RequestError(f"{name}: got {value!r}, wanted a whole number {wanted}")
+
+
+def did_you_mean(name: str, known: Iterable[str]) -> str:
+    """Return the known name most similar to a wrong one, as the end of a message, or "" if none is similar."""
+    similar = get_close_matches(name.lower(), known, n=1)
+    return f"; did you mean {similar[0]}?" if similar else ""
 
 
 def root_cause(error: BaseException) -> str:

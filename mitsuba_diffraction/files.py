@@ -66,6 +66,18 @@ def whole_file(path: str | os.PathLike[str]) -> Iterator[Path]:
         os.close(folder)
 
 
+def examples_folder() -> Path:
+    """Return the folder that holds the scenes and recipes of the package.
+
+    In a checkout they are beside the package; setup.py copies them into it.
+    """
+    package = Path(__file__).parent
+    for root in (package / "examples", package.parent):
+        if (root / "scenes").is_dir():
+            return root
+    raise RuntimeError(f"{package}: the package was installed without its scenes and recipes")
+
+
 @contextmanager
 def encoded_file(path: str | os.PathLike[str]) -> Iterator[BinaryIO]:
     """Yield a buffer named `path`, and write its contents to `path` by `whole_file` if the block succeeds.

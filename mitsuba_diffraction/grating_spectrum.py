@@ -17,7 +17,7 @@ import threading
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from pathlib import Path
-from typing import Any
+from typing import Any, ClassVar
 
 import numpy as np
 
@@ -25,14 +25,14 @@ from .energy.table import EnergyTable
 from .errors import RequestError
 from .progress import stage
 from .scalar_theory import Waves
-from .settings import REPRESENTATIONS, Settings
-from .spectrum.exr import doubles, one_line, read, write
+from .settings import REPRESENTATIONS, ScalarSettings
+from .spectrum.exr import doubles, one_line, read_channels, write_channels
 from .spectrum.grids import OrderGrid, SplineGrid
 from .spectrum.power_spectrum import PowerSpectrum
 from .spectrum.tables import AmplitudeTable, SliceTable
 
-FORMAT = "mitsuba_diffraction grating spectrum"
-FORMAT_VERSION = 10
+SCALAR_FORMAT = "mitsuba_diffraction grating spectrum"
+SCALAR_FORMAT_VERSION = 10
 
 # Attributes and their names in files.
 _NUMBERS = {
@@ -58,6 +58,8 @@ class GratingSpectrum(PowerSpectrum):
         waves: the waves of a recipe's surface, from which the error of scalar theory is estimated.
     """
 
+    theory: ClassVar[str] = "scalar"
+
     energy: EnergyTable | None = field(default=None, repr=False)
     waves: Waves | None = field(default=None, repr=False)
 
@@ -65,6 +67,22 @@ class GratingSpectrum(PowerSpectrum):
     def warning(self) -> str:
         """A sentence if scalar theory is inaccurate in light of the wavelengths of the spectrum, otherwise ""."""
         return "" if self.waves is None else self.waves.error(self.wavelengths).warning
+
+    @property
+    def concerns(self) -> list[str]:
+        """Sentences on errors of the spectrum that exceed what was requested or can be trusted."""
+        return list(filter(None, [self.excess, self.warning]))
+
+    @property
+    def summary(self) -> str:
+        """The table and its errors, in two lines."""
+        size, tolerance = f"{self.megabytes:.3g} MB", f"(tolerance {self.tolerance:.3g})"
+        scatter = "" if self.standard_error is None else f", standard error of one scan {self.standard_error:.2g}"
+        return (
+            f"{self.representation}, {size}, error {self.error:.1e} {tolerance}{scatter}\n"
+            f"truncated, at most: {self.truncated_power:.1e} of the power at weak frequencies; "
+            f"{self.unresolved_power:.1e} at frequencies that no direction reaches or no pixel resolves"
+        )
 
     def energy_table(self) -> EnergyTable:
         """Return the table of E, which bounds the albedo by one; computed at the first call unless read from a file."""
@@ -114,7 +132,7 @@ class GratingSpectrum(PowerSpectrum):
             header |= {"heightScale": doubles(table.height), "heightsFrom": self.settings.heights_from}
         channels = _channels(table)
         header["channelCount"] = len(channels)
-        write(path, FORMAT, FORMAT_VERSION, header, channels, recipe)
+        write_channels(path, SCALAR_FORMAT, SCALAR_FORMAT_VERSION, header, channels, recipe)
 
     @classmethod
     def load(cls, path: str | os.PathLike[str], recipe: str | None = None) -> GratingSpectrum:
@@ -126,7 +144,7 @@ class GratingSpectrum(PowerSpectrum):
                 representation, or was not built from that recipe.
         """
         path = Path(path)
-        header, channels = read(path, FORMAT, FORMAT_VERSION, recipe)
+        header, channels = read_channels(path, SCALAR_FORMAT, SCALAR_FORMAT_VERSION, recipe)
         if (got := header.get("representation")) not in REPRESENTATIONS[1:]:
             raise RequestError(f"{path}: got representation {got!r}, wanted one of {', '.join(REPRESENTATIONS[1:])}")
         try:
@@ -145,7 +163,7 @@ class GratingSpectrum(PowerSpectrum):
                 series = {"terms": header["channelCount"] // 2, "heights_from": header["heightsFrom"]}
             entries: dict[str, Any] = {name: header[key] for name, key in _OTHERS.items()}
             entries |= {name: _single(header[key]) for name, key in _NUMBERS.items()}
-            settings = Settings(
+            settings = ScalarSettings(
                 extent=header["extent"],
                 wavelengths=_pair(header["wavelengths"]),
                 representation=header["representation"],

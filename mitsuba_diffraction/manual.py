@@ -1,7 +1,8 @@
-"""Parameters of a plugin: its docstring is made from them, and docs/plugin.md is tested against them."""
+"""Parameters of a plugin: its docstring and the tables of docs/plugin.md are made from them."""
 
 from __future__ import annotations
 
+import re
 import textwrap
 from collections.abc import Iterable
 from dataclasses import dataclass
@@ -9,7 +10,10 @@ from dataclasses import dataclass
 
 @dataclass(frozen=True)
 class Parameter:
-    """One parameter, or several that share a row: their names, type and meaning, and the default where there is one."""
+    """One parameter, or several that share a row: their names, type and meaning, and the default where there is one.
+
+    The meaning is Markdown of one line, with links as from a page in docs/.
+    """
 
     name: str
     type: str
@@ -21,6 +25,7 @@ def listed(parameters: Iterable[Parameter]) -> str:
     """Format the parameters as paragraphs of a docstring."""
     lines = []
     for p in parameters:
-        text = f"{p.name} ({p.type}): {p.meaning}{f' ({p.default})' if p.default else ''}."
+        meaning = re.sub(r"\[([^]]*)\]\([^)]*\)", r"\1", p.meaning)  # links of the manual
+        text = f"{p.name} ({p.type}): {meaning}{f' ({p.default})' if p.default else ''}."
         lines += textwrap.wrap(text, 116, initial_indent=" " * 4, subsequent_indent=" " * 8)
     return "\n".join(lines)

@@ -2,9 +2,12 @@
 
 from __future__ import annotations
 
+import inspect
 import os
 import warnings
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
+from dataclasses import replace
+from typing import Any
 
 import numpy as np
 
@@ -12,11 +15,12 @@ from .errors import RequestError
 from .files import cache_folder
 from .grating_spectrum import GratingSpectrum
 from .progress import Progress, silent
-from .rigorous import build as rigorous
-from .rigorous.efficiencies import one_thread
-from .rigorous.spectrum import FORMAT as RIGOROUS_FORMAT
-from .rigorous.spectrum import RigorousSpectrum
-from .settings import SERIES, SUN_COHERENCE_LENGTH, VISIBLE, Settings
+from .rigorous import build_table as rigorous
+from .rigorous.rigorous_spectrum import RIGOROUS_FORMAT as RIGOROUS_FORMAT
+from .rigorous.rigorous_spectrum import RigorousSpectrum
+from .rigorous.solver import one_thread
+from .scalar_theory import scalar_waves
+from .settings import SERIES, SPECTRUM_PARAMETERS, RigorousSettings, ScalarSettings, Settings
 from .spectrum import build as scalar
 from .surface.heightfield import HeightField
 
@@ -26,24 +30,7 @@ _MAX_HEADER_BYTES = 2**16  # which contain the name of the format
 
 
 def precompute(
-    height_field: HeightField | Sequence[HeightField],
-    *,
-    extent: str = "tile",
-    coherence_length: float = SUN_COHERENCE_LENGTH,
-    wavelengths: tuple[float, float] = VISIBLE,
-    largest_angle: float = 90.0,
-    representation: str = "auto",
-    tolerance: float | None = None,
-    largest_height_range: float = 20.0,
-    terms: int | None = None,
-    heights_from: str = "mean",
-    progress: Progress = silent,
-    theory: str = "scalar",
-    int_ior: complex | str | None = None,
-    material: str | None = None,
-    ext_ior: float = 1.0,
-    polarised: bool = False,
-    transmission: str = "none",
+    height_field: HeightField | Sequence[HeightField], *, progress: Progress = silent, **settings: Any
 ) -> Spectrum:
     """Compute the spectrum of the phase e^{iκh}, or the table of rigorous efficiencies, its error at most `tolerance`.
 
@@ -52,8 +39,8 @@ def precompute(
             irregular surface. The spectra of patches are averaged.
         progress: called with (steps done, steps in all). An interrupted build of rigorous theory resumes from
             intermediate results in the cache folder.
-
-    For all other arguments see `Settings`.
+        settings: `theory`, "scalar" by default or "rigorous", and the parameters of `ScalarSettings` or of
+            `RigorousSettings`.
 
     Returns:
         The spectrum; its `error` is measured at values of κ that were not used to build it.
@@ -66,43 +53,35 @@ def precompute(
         UserWarning: if the pixels are too coarse to resolve all frequencies that the shortest wavelength reaches, a
             sample is too small for the coherence length, or `terms` are too few for the tolerance.
     """
-    settings = Settings(
-        extent=extent,
-        coherence_length=coherence_length,
-        wavelengths=wavelengths,
-        largest_angle=largest_angle,
-        representation=representation,
-        tolerance=tolerance,
-        largest_height_range=largest_height_range,
-        terms=terms,
-        heights_from=heights_from,
-        theory=theory,
-        int_ior=int_ior,
-        material=material,
-        ext_ior=ext_ior,
-        polarised=polarised,
-        transmission=transmission,
-    )
+    for name in settings.keys() - SPECTRUM_PARAMETERS.keys():
+        raise TypeError(f"precompute() got an unexpected keyword argument {name!r}")
+    request = Settings.of(**settings)
     patches = (height_field,) if isinstance(height_field, HeightField) else tuple(height_field)
     if not all(isinstance(patch, HeightField) for patch in patches):
         raise RequestError(f"height_field: got {type(height_field).__name__}, wanted a HeightField or several")
-    spectrum = build_spectrum(patches, settings, progress)
-    if isinstance(spectrum, GratingSpectrum) and spectrum.excess:
-        warnings.warn(spectrum.excess, stacklevel=2)
+    spectrum = build_spectrum(patches, request, progress)
+    for concern in spectrum.concerns:
+        warnings.warn(concern, stacklevel=2)
     return spectrum
 
 
-def build_spectrum(patches: Sequence[HeightField], settings: Settings, progress: Progress = silent) -> Spectrum:
-    """Compute the spectrum as `precompute`, from patches and settings."""
+def _with_settings(function: Callable[..., Spectrum]) -> inspect.Signature:
+    """Return the signature of a function whose last parameter stands for the settings by name."""
+    own = list(inspect.signature(function).parameters.values())[:-1]
+    return inspect.Signature([*own, *SPECTRUM_PARAMETERS.values()], return_annotation="Spectrum")
+
+
+precompute.__dict__["__signature__"] = _with_settings(precompute)
+
+
+def build_spectrum(
+    patches: Sequence[HeightField], settings: Settings, progress: Progress = silent, *, keep_waves: bool = False
+) -> Spectrum:
+    """Compute the spectrum as `precompute`, from patches and settings; `keep_waves`: with `GratingSpectrum.waves`."""
     if not patches:
         raise RequestError("patches: got none, wanted at least one")
     if len(patches) > 1 and settings.extent != "tile":
         raise RequestError(f"patches: got {len(patches)} with extent {settings.extent!r}, wanted 1, or extent 'tile'")
-    if len(patches) > 1 and settings.representation in SERIES:
-        raise RequestError(
-            f"representation: got {settings.representation!r} with {len(patches)} patches, wanted 'slices', or "
-            "patches = 1: an average has no amplitude"
-        )
     first = patches[0]
     for patch in patches[1:]:
         if patch.shape != first.shape or not np.allclose(patch.tile_size, first.tile_size, rtol=1e-9):
@@ -113,14 +92,28 @@ def build_spectrum(patches: Sequence[HeightField], settings: Settings, progress:
             f"heights: got a range of {height_range:.4g} µm, wanted at most {settings.largest_height_range:g}: are "
             "these nanometres? If the surface is so deep, raise largest_height_range of `precompute`"
         )
-    if settings.theory == "scalar":
+    if isinstance(settings, ScalarSettings):
+        if len(patches) > 1 and settings.representation in SERIES:
+            raise RequestError(
+                f"representation: got {settings.representation!r} with {len(patches)} patches, wanted 'slices', or "
+                "patches = 1: an average has no amplitude"
+            )
         with one_thread():
-            return GratingSpectrum(**vars(scalar.build_spectrum(patches, settings, progress)))
+            found = GratingSpectrum(**vars(scalar.build_power_spectrum(patches, settings, progress)))
+        if not keep_waves:
+            return found
+        return replace(found, waves=scalar_waves(first, found.extent, found.wavelengths))
+    assert isinstance(settings, RigorousSettings)
     if len(patches) > 1:
         raise RequestError(
             f"theory: got rigorous and {len(patches)} patches ({first.source}, …), wanted one, of one row"
         )
-    return rigorous.build_spectrum(first, settings, progress, cache_folder())
+    return rigorous.build_rigorous(first, settings, progress, cache_folder())
+
+
+def build_versions(settings: Settings) -> list[int]:
+    """Return the versions of the code that builds a spectrum of this theory alone."""
+    return [rigorous.BUILD_VERSION] if isinstance(settings, RigorousSettings) else []
 
 
 def load_spectrum(path: str | os.PathLike[str], recipe: str | None = None) -> Spectrum:

@@ -9,9 +9,18 @@ from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import contextmanager
 
 from rich.console import Console, RenderableType
-from rich.progress import BarColumn, MofNCompleteColumn, TextColumn, TimeElapsedColumn, TimeRemainingColumn
+from rich.progress import (
+    BarColumn,
+    MofNCompleteColumn,
+    ProgressColumn,
+    Task,
+    TextColumn,
+    TimeElapsedColumn,
+    TimeRemainingColumn,
+)
 from rich.progress import Progress as Bars
 from rich.table import Table
+from rich.text import Text
 
 NAME = "mitsuba-diffraction"
 
@@ -22,6 +31,7 @@ err = Console(stderr=True, highlight=False, soft_wrap=True)
 
 _MIN_REPORTED_SECONDS = 2.0  # of work before a log or a notebook shows progress
 _MIN_REPORTED_DURATION = 10.0  # s, of a command
+_UNITS_OF_BYTES = ("GB", 1e9), ("MB", 1e6), ("kB", 1e3)
 _lock = threading.Lock()
 _stages: list[str] = []  # nested blocks of code, the innermost last
 _durations: dict[str, float] = {}  # s, by the name of a stage
@@ -116,6 +126,12 @@ def table(columns: Iterable[str], rows: Iterable[Sequence[str]], texts: int = 1)
     return shown
 
 
+def bytes_text(count: float) -> str:
+    """Format a number of bytes, such as 100 MB."""
+    unit, scale = next(((unit, scale) for unit, scale in _UNITS_OF_BYTES if count >= scale), _UNITS_OF_BYTES[-1])
+    return f"{count / scale:.{0 if count >= 10 * scale else 1}f} {unit}"
+
+
 def _count(done: float, total: int, unit: str) -> str:
     """Format the part done."""
     return f"{done} {unit}" if unit.startswith("%") else f"{done:.10g} of {total} {unit}".rstrip()
@@ -139,6 +155,19 @@ def log_lines(
     return show
 
 
+def _say_stage(label: str, depth: int, counted: threading.Event) -> None:
+    """Say in a log what is being done, unless something has been counted."""
+    if not counted.is_set():
+        say(label, _after("", depth) or "computing")
+
+
+class _Doing(ProgressColumn):
+    """Column of a bar that shows what is being done, also while nothing is counted."""
+
+    def render(self, task: Task) -> Text:
+        return Text(task.fields["doing"](task))
+
+
 @contextmanager
 def progress_bar(label: str, unit: str = "", begin: str = "") -> Iterator[Callable[..., None]]:
     """Yield a function that shows progress: it takes the part done, the total, and the relative error if there is one.
@@ -155,7 +184,19 @@ def progress_bar(label: str, unit: str = "", begin: str = "") -> Iterator[Callab
             yield shown
         return
     if not err.is_terminal:
-        yield log_lines(label, unit, begin)
+        show_line, counted = log_lines(label, unit, begin), threading.Event()
+
+        def show_in_log(*numbers: float) -> None:
+            counted.set()
+            show_line(*numbers)
+
+        waiting = threading.Timer(_MIN_REPORTED_SECONDS, _say_stage, (label, len(_stages), counted))
+        waiting.daemon = True
+        waiting.start()
+        try:
+            yield show_in_log
+        finally:
+            waiting.cancel()
         return
     with _lock:
         if outermost := not _bars:
@@ -163,7 +204,7 @@ def progress_bar(label: str, unit: str = "", begin: str = "") -> Iterator[Callab
                 TextColumn("{task.description}", markup=False),
                 BarColumn(),
                 MofNCompleteColumn(),
-                TextColumn("{task.fields[after]}"),
+                _Doing(),
                 TimeElapsedColumn(),
                 TimeRemainingColumn(),
             )
@@ -172,11 +213,18 @@ def progress_bar(label: str, unit: str = "", begin: str = "") -> Iterator[Callab
             _bars[0].start()
         bars = _bars[0]
     depth = len(_stages)
-    task = bars.add_task(label, total=None, after=begin or unit)
+
+    def doing(task: Task) -> str:
+        error = task.fields["error"]
+        after = _after("" if task.total is None else unit, depth) + (
+            "" if math.isnan(error) else f", error {error:.2g}"
+        )
+        return after if task.completed or not begin else ", ".join([begin, *_stages[depth:][-1:]])
+
+    task = bars.add_task(label, total=None, doing=doing, error=math.nan)
 
     def show(done: int, total: int, error: float = math.nan) -> None:
-        after = _after(unit, depth) + ("" if math.isnan(error) else f", error {error:.2g}")
-        bars.update(task, completed=done, total=total, after=after if done else begin or after)
+        bars.update(task, completed=done, total=total, error=error)
 
     try:
         yield show

@@ -24,7 +24,7 @@ prepare = [                      # steps of surface/prepare.py, in this order
 ]
 fill_missing = true              # interpolate missing pixels; default: refuse them
 
-[spectrum]                       # the parameters of settings.Settings, all optional
+[spectrum]                       # the parameters of settings.py, all optional
 extent = "tile"
 wavelengths = [360.0, 830.0]     # nm
 """
@@ -41,21 +41,19 @@ import warnings
 import weakref
 from collections.abc import Callable, Mapping
 from contextlib import AbstractContextManager, suppress
-from dataclasses import dataclass, field, fields, replace
+from dataclasses import dataclass, field
 from functools import cached_property
 from pathlib import Path
 from typing import Any
 
-from .errors import RequestError, check_whole
-from .files import cache_folder, refuse_special
-from .grating_spectrum import FORMAT_VERSION, GratingSpectrum
+from .errors import RequestError, check_whole, did_you_mean
+from .files import cache_folder, examples_folder, refuse_special
+from .grating_spectrum import SCALAR_FORMAT_VERSION
 from .materials import is_file
-from .precomputation import Spectrum, build_spectrum, load_spectrum
+from .precomputation import Spectrum, build_spectrum, build_versions, is_rigorous, load_spectrum
 from .progress import Progress, no_progress, part, silent, stage
-from .rigorous import build as rigorous
-from .scalar_theory import scalar_waves
-from .settings import Settings
-from .surface.gratings import COHERENCE_LENGTHS, PATCHES, PROFILES
+from .settings import SPECTRUM_PARAMETERS, ScalarSettings, Settings
+from .surface.gratings import COHERENCE_LENGTHS, PATCHES, PROFILES, RENAMED, profile_name
 from .surface.heightfield import HeightField
 from .surface.prepare import apply_steps, check_steps
 from .surface.readers import read_height_field
@@ -66,13 +64,13 @@ else:
     import tomli as tomllib
 
 _SCAN_KEYS = frozenset({"scan", "pixel_size", "height_range", "fill_missing", "channel", "unit", "prepare"})
-_SPECTRUM_KEYS = frozenset(f.name for f in fields(Settings))
+_SPECTRUM_KEYS = frozenset(SPECTRUM_PARAMETERS)
 REQUESTED = "representation", "terms", "heights_from", "tolerance"  # of a spectrum; they may override a recipe's
 _OF_PROFILE = "coherence_length", "largest_height_range", *REQUESTED
 MAX_PATCHES = 1000  # of which the mean has three per cent of the speckle of one patch
 # Incremented when the same input gives a different result, to invalidate the cache.
 _BUILD_VERSION = 10
-# Spectra in the package (precompute/ready_spectra.py), named as in the cache.
+# Spectra in the package (tools/data/ready_spectra.py), named as in the cache.
 READY_SPECTRA = Path(__file__).parent / "data" / "spectra"
 _HEIGHTS_TIME_FRACTION = 0.3  # of the build, spent on the heights of several patches, roughly
 # Mitsuba constructs plugins in parallel; only one of those with the same recipe may compute its spectrum.
@@ -90,6 +88,31 @@ def parameters_of_profile(name: str) -> tuple[str, ...]:
     return (*inspect.signature(PROFILES[name]).parameters, "patches", *_OF_PROFILE)
 
 
+def source_named(name: str) -> str:
+    """Return the name of a profile or of a file as it is, and for the name of a recipe in the package its path.
+
+    Raises:
+        RequestError: if the name has no suffix, and there is no such file, profile or recipe.
+
+    Warns:
+        FutureWarning: if the name was that of another surface.
+    """
+    if name in PROFILES or Path(name).suffix or os.path.exists(name):
+        return name
+    recipes = {path.stem: path for path in sorted((examples_folder() / "precompute").glob("*.toml"))}
+    if name not in recipes:
+        similar = did_you_mean(name, [*PROFILES, *recipes])
+        wanted = similar or f", wanted {', '.join(dict.fromkeys([*PROFILES, *recipes]))}, or a file"
+        raise RequestError(f"{name}: no file and no surface has this name{wanted}")
+    if name in RENAMED:
+        warnings.warn(
+            f"{name}: the measured skin; the synthetic one, which had this name until version 0.2, is {RENAMED[name]}",
+            FutureWarning,
+            stacklevel=2,
+        )
+    return str(recipes[name])
+
+
 @dataclass(frozen=True)
 class Recipe:
     """A surface and the parameters of its spectrum.
@@ -104,7 +127,7 @@ class Recipe:
     """
 
     surface: Mapping[str, Any]
-    settings: Settings = field(default_factory=Settings)
+    settings: Settings = field(default_factory=ScalarSettings)
     folder: Path = Path()
 
     def __post_init__(self) -> None:
@@ -112,8 +135,8 @@ class Recipe:
         if ("profile" in self.surface) == ("scan" in self.surface):
             got = ", ".join(sorted(self.surface)) or "nothing"
             raise RequestError(f"[surface]: got {got}, wanted either a profile or a scan")
-        if "profile" in self.surface and self.surface["profile"] not in tuple(PROFILES):
-            raise RequestError(f"profile: got {self.surface['profile']!r}, wanted one of {', '.join(PROFILES)}")
+        if "profile" in self.surface:
+            object.__setattr__(self, "surface", {**self.surface, "profile": profile_name(self.surface["profile"])})
         if "profile" in self.surface and "patches" in self.surface:
             patches = self.surface["patches"]
             check_whole("patches", patches, 1, MAX_PATCHES)
@@ -142,16 +165,15 @@ class Recipe:
         Raises:
             ValueError: if a value is wrong, or there is no such profile.
         """
-        if name not in PROFILES:
-            raise RequestError(f"profile: got {name!r}, wanted one of {', '.join(PROFILES)}")
+        name = profile_name(name)
         given = {key: parameters[key] for key in parameters_of_profile(name) if key in parameters}
         default = {"coherence_length": COHERENCE_LENGTHS[name]} if name in COHERENCE_LENGTHS else {}
         of_spectrum = {key: given.pop(key) for key in _OF_PROFILE if key in given}
-        return cls({"profile": name, **given}, Settings(**{**default, **of_spectrum, **settings}))
+        return cls({"profile": name, **given}, Settings.of(**{**default, **of_spectrum, **settings}))
 
     @classmethod
     def load(cls, path: str | os.PathLike[str], **settings: Any) -> Recipe:
-        """Read a recipe; `settings`, by their names in `Settings`, override its own under `[spectrum]`.
+        """Read a recipe; `settings`, by their names, override its own under `[spectrum]`.
 
         Raises:
             FileNotFoundError: if there is no such file.
@@ -175,7 +197,7 @@ class Recipe:
             spectrum = {**spectrum, **{name: str(path.parent / spectrum[name]) for name in of_files}, **settings}
             _refuse_unknown("[spectrum]", spectrum, _SPECTRUM_KEYS)
             _refuse_other_values(spectrum)
-            return cls(surface, Settings(**spectrum), path.parent)
+            return cls(surface, Settings.of(**spectrum), path.parent)
         except RequestError as error:
             in_file = str(error).partition(":")[0] not in settings
             raise RequestError(f"{path}: {error}" if in_file else str(error)) from None
@@ -184,7 +206,7 @@ class Recipe:
     def files(self) -> list[Path]:
         """The files that the recipe names, if any: its scan, and the file of an index."""
         scans = [self.folder / self.surface["scan"]] if "scan" in self.surface else []
-        return scans + ([Path(str(self.settings.material))] if is_file(self.settings.material) else [])
+        return scans + ([Path(str(index))] if is_file(index := self.settings.chosen.get("material")) else [])
 
     @property
     def patches(self) -> int:
@@ -249,16 +271,11 @@ class Recipe:
         """Compute the spectrum; `progress` is called with (steps done, steps in all)."""
         patches = self.height_fields(part(progress, 0, _HEIGHTS_TIME_FRACTION))
         report = part(progress, _HEIGHTS_TIME_FRACTION if len(patches) > 1 else 0, 1)
-        spectrum = build_spectrum(patches, self.settings, report)
-        if isinstance(spectrum, GratingSpectrum):
-            spectrum = replace(spectrum, waves=scalar_waves(patches[0], spectrum.extent, spectrum.wavelengths))
-        return spectrum
+        return build_spectrum(patches, self.settings, report, keep_waves=True)
 
     def digest(self) -> str:
         """Return the SHA-256 of everything that determines the spectrum: the recipe and the contents of the scan."""
-        versions = [FORMAT_VERSION, _BUILD_VERSION]
-        if self.settings.theory == "rigorous":
-            versions.append(rigorous.BUILD_VERSION)
+        versions = [SCALAR_FORMAT_VERSION, _BUILD_VERSION, *build_versions(self.settings)]
         content = hashlib.sha256(".".join(map(str, versions)).encode())
         surface = {name: value for name, value in self.surface.items() if name != "scan"}
         for scan in self.files:
@@ -306,6 +323,13 @@ class Recipe:
                 stacklevel=1,
             )
         return spectrum
+
+
+def theory_in(path: Path) -> str:
+    """Return the theory of a recipe, or of a saved spectrum."""
+    if path.suffix.lower() == ".toml":
+        return Recipe.load(path).settings.theory
+    return "rigorous" if is_rigorous(path) else "scalar"
 
 
 def _refuse_unknown(where: str, table: Mapping[str, Any], known: frozenset[str]) -> None:

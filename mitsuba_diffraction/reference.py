@@ -12,7 +12,7 @@ import scipy.fft
 from numpy.typing import ArrayLike, NDArray
 
 from .errors import RequestError
-from .settings import SUN_COHERENCE_LENGTH, Settings, lobe_width, matching
+from .settings import SUN_COHERENCE_LENGTH, ScalarSettings, lobe_width, matching
 from .spectrum.sample import UNIFORM, WindowAxis, effective_coherence_length, window_axes
 from .surface.heightfield import HeightField
 
@@ -74,7 +74,7 @@ def power_spectrum(
         ValueError: if the extent is unknown, the coherence length is not positive or, for a sample, below four pixels,
             an argument is not finite, or the shapes do not match.
     """
-    Settings(extent, coherence_length)
+    ScalarSettings(extent=extent, coherence_length=coherence_length)
     q, kappa = matching(q, kappa)
     if not np.isfinite(kappa).all():
         raise RequestError("kappa: got numbers that are not finite, wanted rad/µm")

@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import inspect
 import math
+from collections.abc import Callable
 from dataclasses import dataclass, fields
-from typing import Any
+from typing import Any, ClassVar, cast
 
 import numpy as np
 import scipy.special
@@ -21,7 +23,6 @@ SUN_COHERENCE_LENGTH = 65.0  # µm, for the angular diameter of 0.53°
 MIN_COHERENCE_LENGTH, MAX_COHERENCE_LENGTH = 1e-3, 1e6
 
 EXTENTS = ("tile", "sample")
-THEORIES = ("scalar", "rigorous")
 # "auto" is "slices"; the others are series of the amplitude.
 SERIES = ("taylor", "chebyshev")
 REPRESENTATIONS = ("auto", "slices", *SERIES)
@@ -36,81 +37,62 @@ TAIL_FRACTION = 0.4  # of the tolerance, for the truncated tails of the lobes
 TRANSMISSIONS = ("none", "interface", "sheet")
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class Settings:
-    """The parameters of a spectrum, as recipes, scenes, the command line and `precompute` have them.
+    """The parameters that a spectrum has in both theories; `Settings.of` makes the parameters of one theory.
+
+    Recipes, scenes, the command line and `precompute` take the parameters of both by name, and `theory`: "scalar", or
+    "rigorous" (Maxwell's equations, for a tile of one row and one material only).
 
     Attributes:
-        extent: "tile": the patch repeats periodically; "sample": it is a piece of a larger, irregular surface.
         coherence_length: L_c in µm.
         wavelengths: (shortest, longest) in nm; in a scene the default is divided by the index next to the relief
             (`wavelengths_inside`).
-        largest_angle: largest angle of incidence and exit in the scene, degrees from the normal; below 90, fewer
-            frequencies are kept.
-        representation: "slices" (also chosen by "auto"): powers; or a series of the amplitudes of one tile, "taylor"
-            (Stam 1999) or "chebyshev" (Dhillon and Ghosh 2016).
-        tolerance: bound of max over κ of ∫|S_approx(q; κ) − S_exact(q; κ)| dq, a fraction of the reflected power; by
-            default 1e-2, and 1e-3 for one tile whose orders do not overlap. In rigorous theory, the bound of
-            `RigorousSpectrum.error`, by default 1e-2. With `terms` it may be one or more, for a picture of a series
-            that is known to be wrong.
+        tolerance: bound of the error. In scalar theory, of max over κ of ∫|S_approx(q; κ) − S_exact(q; κ)| dq, a
+            fraction of the reflected power; by default 1e-2, and 1e-3 for one tile whose orders do not overlap. With
+            `terms` it may be one or more, for a picture of a series that is known to be wrong. In rigorous theory, of
+            `RigorousSpectrum.error`, by default 1e-2.
         largest_height_range: in µm; deeper surfaces are refused, since their heights may be in nm. Time and memory grow
             with the height range.
-        terms: N of a series, whatever its error; None, in files "auto", is the number that the tolerance requires.
-        heights_from: the level of h = 0 in a series: "mean" or "lowest".
-        theory: "scalar", or "rigorous": Maxwell's equations, for a tile of one row and one material only.
-        int_ior: in rigorous theory, index of a dielectric, or n + ik; a name or a file is kept as material.
-        material: or a conductor by Mitsuba's name, a medium with dispersion, or a file (`materials.index_of`).
-        ext_ior: in rigorous theory, index of the medium above relative to air, for a grating under a coat; wavelengths
-            are measured in this medium.
-        polarised: in rigorous theory, whether to store Mueller matrices for polarised variants; the table is then
-            seventeen times as large.
-        transmission: in rigorous theory, "interface" or "sheet" to include the light that a dielectric transmits.
 
     Raises:
         ValueError: if one is out of range, or they contradict each other.
     """
 
-    extent: str = "tile"
+    theory: ClassVar[str]
+    min_tolerance: ClassVar[float]
+    refusal: ClassVar[str]
+    """What is wrong with parameters of the other theory."""
+
     coherence_length: float = SUN_COHERENCE_LENGTH
     wavelengths: tuple[float, float] = VISIBLE
-    largest_angle: float = 90.0
-    representation: str = "auto"
     tolerance: float | None = None
     largest_height_range: float = 20.0
-    terms: int | None = None
-    heights_from: str = "mean"
-    theory: str = "scalar"
-    int_ior: complex | str | None = None
-    material: str | None = None
-    ext_ior: float = 1.0
-    polarised: bool = False
-    transmission: str = "none"
+
+    @staticmethod
+    def of(theory: str = "scalar", **given: Any) -> Settings:
+        """Return the parameters of a theory; those of the other theory may be given if they have their defaults.
+
+        Raises:
+            ValueError: as the classes, or if there is no such theory, or a parameter is of the other one.
+        """
+        if theory not in tuple(_SETTINGS):
+            raise RequestError(f"theory: got {theory!r}, wanted one of {', '.join(THEORIES)}")
+        if given.get("terms") == "auto":
+            given["terms"] = None
+        kind = _SETTINGS[theory]
+        foreign = SPECTRUM_PARAMETERS.keys() - {field.name for field in fields(kind)}
+        for name in sorted(foreign & given.keys()):
+            if (value := given.pop(name)) != SPECTRUM_PARAMETERS[name].default:
+                raise RequestError(f"theory: got {theory} with {name} {value!r}, {kind.refusal}")
+        return kind(**given)
 
     def __post_init__(self) -> None:
-        for name, known in (
-            ("extent", EXTENTS),
-            ("theory", THEORIES),
-            ("representation", REPRESENTATIONS),
-            ("heights_from", ORIGINS),
-            ("transmission", TRANSMISSIONS),
-        ):
-            if (value := getattr(self, name)) not in known:
-                raise RequestError(f"{name}: got {value!r}, wanted one of {', '.join(known)}")
-        min_tolerance = MIN_TOLERANCE if self.theory == "scalar" else MIN_RIGOROUS_TOLERANCE
-        for name, valid, wanted in (
-            ("coherence_length", lambda x: lobe_width(x) > 0, "a number"),
-            ("largest_angle", lambda x: 0 < x <= 90, "degrees from the normal, above 0, at most 90"),
-            (
-                "tolerance",
-                lambda x: min_tolerance <= x < (math.inf if isinstance(self.terms, int) else 1),
-                f"a fraction of the light, from {min_tolerance:g} to 1",
-            ),
-            ("largest_height_range", lambda x: x > 0, "a positive number of µm"),
-            ("ext_ior", lambda x: 1 <= x <= 10, "the index of the medium above, from 1 to 10"),
-        ):
-            value = getattr(self, name)
-            if not ((is_number(value) and valid(value)) or (name == "tolerance" and value is None)):
-                raise RequestError(f"{name}: got {value!r}, wanted {wanted}")
+        self._check("coherence_length", lambda x: lobe_width(x) > 0, "a number")
+        if self.tolerance is not None:
+            wanted = f"a fraction of the light, from {self.min_tolerance:g} to 1"
+            self._check("tolerance", lambda x: self.min_tolerance <= x < self._tolerance_limit, wanted)
+        self._check("largest_height_range", lambda x: x > 0, "a positive number of µm")
         try:
             shortest, longest = (float(w) for w in self.wavelengths)
         except (TypeError, ValueError, OverflowError):
@@ -121,38 +103,67 @@ class Settings:
                 f"{MIN_WAVELENGTH:g} nm"
             )
         object.__setattr__(self, "wavelengths", (shortest, longest))
-        self._check_series()
-        if isinstance(self.int_ior, str) and self.material is None:
-            object.__setattr__(self, "material", self.int_ior)
-            object.__setattr__(self, "int_ior", None)
-        if not isinstance(self.polarised, bool):
-            raise RequestError(f"polarised: got {self.polarised!r}, wanted True or False")
-        if self.theory == "rigorous" and (self.extent, self.largest_angle, self.representation) != ("tile", 90, "auto"):
-            raise RequestError(
-                f"theory: got rigorous with extent {self.extent!r}, largest_angle {self.largest_angle!r} and "
-                f"representation {self.representation!r}; its table is always that of a tile, for all directions"
-            )
-        of_rigorous = self.int_ior, self.material, self.ext_ior, self.polarised, self.transmission
-        if self.theory == "scalar" and of_rigorous != (None, None, 1, False, "none"):
-            raise RequestError(
-                "int_ior, material, ext_ior, polarised, transmission: wanted none of them in scalar theory, whose "
-                "spectrum holds for every material"
-            )
-        if self.transmission != "none":
-            if self.int_ior is None or np.imag(self.int_ior) != 0:
-                raise RequestError(
-                    f"transmission: got {self.transmission} with material {self.material!r} and int_ior "
-                    f"{self.int_ior!r}, wanted a dielectric of one index, a number"
-                )
-            if self.ext_ior != 1:
-                raise RequestError(
-                    f"transmission: got {self.transmission} and ext_ior {self.ext_ior!r}, wanted no coat"
-                )
 
-    def _check_series(self) -> None:
-        """Raise RequestError if parameters of a series are invalid, or given without a series."""
-        if self.terms == "auto":
-            object.__setattr__(self, "terms", None)
+    def _check(self, name: str, valid: Callable[[float], bool], wanted: str) -> None:
+        """Raise RequestError unless a parameter is a valid number."""
+        value = getattr(self, name)
+        if not (is_number(value) and valid(value)):
+            raise RequestError(f"{name}: got {value!r}, wanted {wanted}")
+
+    def _check_known(self, name: str, known: tuple[str, ...]) -> None:
+        """Raise RequestError unless a parameter is one of the known texts."""
+        if (value := getattr(self, name)) not in known:
+            raise RequestError(f"{name}: got {value!r}, wanted one of {', '.join(known)}")
+
+    @property
+    def _tolerance_limit(self) -> float:
+        return 1.0
+
+    @property
+    def extent(self) -> str:
+        """ "tile", or in scalar theory also "sample"."""
+        return "tile"
+
+    @property
+    def chosen(self) -> dict[str, Any]:
+        """The parameters that differ from the defaults, by name."""
+        values = {name: getattr(self, name) for name in ("theory", *(f.name for f in fields(self)))}
+        return {name: value for name, value in values.items() if value != SPECTRUM_PARAMETERS[name].default}
+
+
+@dataclass(frozen=True, kw_only=True)
+class ScalarSettings(Settings):
+    """The parameters of a spectrum of scalar theory, beside those of `Settings`.
+
+    Attributes:
+        extent: "tile": the patch repeats periodically; "sample": it is a piece of a larger, irregular surface.
+        largest_angle: largest angle of incidence and exit in the scene, degrees from the normal; below 90, fewer
+            frequencies are kept.
+        representation: "slices" (also chosen by "auto"): powers; or a series of the amplitudes of one tile, "taylor"
+            (Stam 1999) or "chebyshev" (Dhillon and Ghosh 2016).
+        terms: N of a series, whatever its error; None, in files "auto", is the number that the tolerance requires.
+        heights_from: the level of h = 0 in a series: "mean" or "lowest".
+
+    Raises:
+        ValueError: if one is out of range, or they contradict each other.
+    """
+
+    theory: ClassVar[str] = "scalar"
+    min_tolerance: ClassVar[float] = MIN_TOLERANCE
+    refusal: ClassVar[str] = "wanted none: the spectrum holds for every material"
+
+    extent: str = "tile"
+    largest_angle: float = 90.0
+    representation: str = "auto"
+    terms: int | None = None
+    heights_from: str = "mean"
+
+    def __post_init__(self) -> None:
+        self._check_known("extent", EXTENTS)
+        self._check_known("representation", REPRESENTATIONS)
+        self._check_known("heights_from", ORIGINS)
+        super().__post_init__()
+        self._check("largest_angle", lambda x: 0 < x <= 90, "degrees from the normal, above 0, at most 90")
         if self.representation not in SERIES:
             for name, value, default in (("terms", self.terms, None), ("heights_from", self.heights_from, "mean")):
                 if value != default:
@@ -169,6 +180,10 @@ class Settings:
             check_whole("terms", self.terms, 1, MAX_TERMS)
 
     @property
+    def _tolerance_limit(self) -> float:
+        return math.inf if isinstance(self.terms, int) else 1.0
+
+    @property
     def lobe_cutoff(self) -> float:
         """Half the side of the square to which a lobe is truncated, in σ_q, for the part of the tolerance that it has.
 
@@ -177,10 +192,69 @@ class Settings:
         assert self.tolerance is not None
         return lobe_cutoff(TAIL_FRACTION * (self.tolerance if self.tolerance < 1 else CONTINUUM_TOLERANCE))
 
-    @property
-    def chosen(self) -> dict[str, Any]:
-        """The parameters that differ from the defaults, by name."""
-        return {f.name: value for f in fields(self) if (value := getattr(self, f.name)) != f.default}
+
+@dataclass(frozen=True, kw_only=True)
+class RigorousSettings(Settings):
+    """The parameters of a table of rigorous theory, of a tile and for all directions, beside those of `Settings`.
+
+    Attributes:
+        int_ior: index of a dielectric, or n + ik; a name or a file is kept as material.
+        material: or a conductor by Mitsuba's name, a medium with dispersion, or a file (`materials.index_of`).
+        ext_ior: index of the medium above relative to air, for a grating under a coat; wavelengths are measured in this
+            medium.
+        polarised: whether to store Mueller matrices for polarised variants; the table is then seventeen times as large.
+        transmission: "interface" or "sheet" to include the light that a dielectric transmits.
+
+    Raises:
+        ValueError: if one is out of range, or they contradict each other.
+    """
+
+    theory: ClassVar[str] = "rigorous"
+    min_tolerance: ClassVar[float] = MIN_RIGOROUS_TOLERANCE
+    refusal: ClassVar[str] = "wanted none: its table is always that of a tile, for all directions"
+
+    int_ior: complex | str | None = None
+    material: str | None = None
+    ext_ior: float = 1.0
+    polarised: bool = False
+    transmission: str = "none"
+
+    def __post_init__(self) -> None:
+        self._check_known("transmission", TRANSMISSIONS)
+        super().__post_init__()
+        self._check("ext_ior", lambda x: 1 <= x <= 10, "the index of the medium above, from 1 to 10")
+        if isinstance(self.int_ior, str) and self.material is None:
+            object.__setattr__(self, "material", self.int_ior)
+            object.__setattr__(self, "int_ior", None)
+        if not isinstance(self.polarised, bool):
+            raise RequestError(f"polarised: got {self.polarised!r}, wanted True or False")
+        if self.transmission != "none":
+            if self.int_ior is None or np.imag(cast(complex, self.int_ior)) != 0:
+                raise RequestError(
+                    f"transmission: got {self.transmission} with material {self.material!r} and int_ior "
+                    f"{self.int_ior!r}, wanted a dielectric of one index, a number"
+                )
+            if self.ext_ior != 1:
+                raise RequestError(
+                    f"transmission: got {self.transmission} and ext_ior {self.ext_ior!r}, wanted no coat"
+                )
+
+
+_SETTINGS: dict[str, type[ScalarSettings] | type[RigorousSettings]] = {
+    kind.theory: kind for kind in (ScalarSettings, RigorousSettings)
+}
+THEORIES = tuple(_SETTINGS)
+SPECTRUM_PARAMETERS = {
+    "theory": inspect.Parameter("theory", inspect.Parameter.KEYWORD_ONLY, default="scalar", annotation="str"),
+    **{
+        field.name: inspect.Parameter(
+            field.name, inspect.Parameter.KEYWORD_ONLY, default=field.default, annotation=field.type
+        )
+        for kind in _SETTINGS.values()
+        for field in fields(kind)
+    },
+}
+"""The parameters of both theories, with their defaults, as `precompute` takes them."""
 
 
 def wavelengths_inside(index: float, scale: float = 1.0, outside: tuple[float, float] = VISIBLE) -> tuple[float, float]:

@@ -11,9 +11,9 @@ import pytest
 
 import mitsuba_diffraction as md
 from mitsuba_diffraction import testing
-from mitsuba_diffraction.rigorous.build import build_spectrum
-from mitsuba_diffraction.rigorous.spectrum import Axes, RigorousSpectrum
-from mitsuba_diffraction.settings import Settings
+from mitsuba_diffraction.rigorous.build_table import build_rigorous
+from mitsuba_diffraction.rigorous.rigorous_spectrum import Axes, RigorousSpectrum
+from mitsuba_diffraction.settings import RigorousSettings
 
 array, direction, floats, vectors = testing.array, testing.direction, testing.floats, testing.vectors
 WAVELENGTHS = (400.0, 500.0, 600.0, 700.0)
@@ -32,7 +32,7 @@ SURFACES = {
     "deep blazed": lambda: md.gratings.blazed(PERIOD, 0.8),
     "sinusoidal": lambda: md.gratings.sinusoidal(PERIOD, 0.3),
     "corner": corner_blaze,
-    "elaphe": lambda: md.gratings.elaphe(8),
+    "elaphe": lambda: md.gratings.elaphe_synthetic(8),
 }
 
 
@@ -58,8 +58,7 @@ def made_up(coherence_length=65.0):
 @functools.cache
 def coarse_glass(transmission):
     """A coarse table of light reflected and transmitted by fine grooves in glass, with Mueller matrices."""
-    settings = Settings(
-        theory="rigorous",
+    settings = RigorousSettings(
         int_ior=1.5,
         wavelengths=(400.0, 500.0),
         tolerance=0.2,
@@ -69,9 +68,9 @@ def coarse_glass(transmission):
     )
     with pytest.MonkeyPatch.context() as patch, warnings.catch_warnings():
         warnings.simplefilter("ignore")
-        patch.setattr("mitsuba_diffraction.rigorous.build._SOLVED_STEPS_TRANSMISSION", ((3, 4, 3),))
-        patch.setattr("mitsuba_diffraction.rigorous.build._CHECK_COUNT", 40)
-        return build_spectrum(md.gratings.blazed(0.3, 0.05, samples=64), settings)
+        patch.setattr("mitsuba_diffraction.rigorous.build_table._SOLVED_STEPS_TRANSMISSION", ((3, 4, 3),))
+        patch.setattr("mitsuba_diffraction.rigorous.build_table._CHECK_COUNT", 40)
+        return build_rigorous(md.gratings.blazed(0.3, 0.05, samples=64), settings)
 
 
 def use(variant):

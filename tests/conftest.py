@@ -15,7 +15,7 @@ from hypothesis import settings
 from threadpoolctl import threadpool_limits
 
 import mitsuba_diffraction as md  # before Dr.Jit, so that it has an LLVM that works
-from mitsuba_diffraction import cli, progress, scalar_theory
+from mitsuba_diffraction import cli, progress
 from mitsuba_diffraction.bsdf import shared
 from mitsuba_diffraction.energy.table import EnergyTable
 
@@ -87,8 +87,8 @@ def tables_of_a_module():
 
 @pytest.fixture(scope="session", autouse=True)
 def results_of_a_session():
-    """Compute E of equal spectra and the solved error of equal profiles once."""
-    energy_of, solved_error, energies, errors = EnergyTable.of, scalar_theory._solved_error, {}, {}
+    """Compute E of equal spectra once."""
+    energy_of, energies = EnergyTable.of, {}
 
     def energy(spectrum, ratios=(1.0,), stack=None, laterals=(1.0, 1.0)):
         key = spectrum.digest, tuple(ratios), stack, tuple(laterals)
@@ -96,15 +96,8 @@ def results_of_a_session():
             energies[key] = energy_of(spectrum, ratios, stack, laterals)
         return energies[key]
 
-    def error(profile, wavelengths):
-        key = profile.heights[:1].tobytes(), profile.pixel_size, wavelengths
-        if key not in errors:
-            errors[key] = solved_error(profile, wavelengths)
-        return errors[key]
-
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(EnergyTable, "of", energy)
-        patch.setattr(scalar_theory, "_solved_error", error)
         yield
 
 
@@ -173,6 +166,7 @@ def command(monkeypatch, capfd):
         monkeypatch.setattr(sys, "argv", [cli.NAME, *arguments])
         # On a slow machine a command says how far it is.
         monkeypatch.setattr(progress, "log_lines", lambda *label: lambda *done: None)
+        monkeypatch.setattr(progress, "_say_stage", lambda *label: None)
         # Warnings are shown, as they are to a person, and what shows them is put back afterwards.
         with warnings.catch_warnings():
             warnings.simplefilter("default")

@@ -217,7 +217,7 @@ def test_the_command_writes_numbers_and_plot(command, tmp_path, monkeypatch):
 @pytest.mark.parametrize(
     ("line", "message"),
     [
-        ("efficiency blazd", "profile: got 'blazd', wanted one of blazed"),
+        ("efficiency blazd", "blazd: no file and no surface has this name; did you mean blazed?"),
         ("efficiency blazed,depth", "blazed,depth: got 'depth', wanted name=value"),
         ("efficiency blazed,depth=1,depth=2", "got 'depth=2', wanted name=value, each name once"),
         ("efficiency blazed --angle 0:60", "--angle: got '0:60', wanted a number"),

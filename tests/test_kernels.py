@@ -24,7 +24,7 @@ BLAZE = {"type": "diffraction_grating", "profile": "blazed", "period": 2.5, "dep
 
 @functools.cache
 def sample() -> md.GratingSpectrum:
-    return md.precompute(md.gratings.elaphe(8), extent="sample", coherence_length=1.5)
+    return md.precompute(md.gratings.elaphe_synthetic(8), extent="sample", coherence_length=1.5)
 
 
 GRATINGS = {

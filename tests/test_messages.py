@@ -70,15 +70,16 @@ def test_messages_name_what_is_available(body, parameters, words, tmp_path, llvm
         ),
         ("convergence scenes/blaze.xml -o out.png", "shader knows no other; choose -D light=bulb or -D light=parallel"),
         (
-            "render scenes/rainbow.xml",
-            "models/disc_metal.ply: no such file; it is made by: python scenes/disc.py && python scenes/ground.py",
-        ),
-        (
             "render scenes/lights",
             "wanted a scene (.xml); this folder holds bulb.xml, desk_lamp.xml, lamp.xml, lamps.xml, "
             "parallel.xml, strip_along_x.xml, strip_along_y.xml, sun.xml",
         ),
-        ("render scenes/foil.xml", "no such file; it is made by: python scenes/foil.py && python scenes/ground.py"),
+        ("render scenes/scan.xml -D spectrum=compact_disk", "did you mean compact_disc?"),
+        ("render scenes/blaze.xml --material surface=compact_disk", "did you mean compact_disc?"),
+        *(
+            (f"{name} compact_disk", "compact_disk: no file and no surface has this name; did you mean compact_disc?")
+            for name in ("inspect", "precompute", "view", "efficiency", "validate")
+        ),
     ],
 )
 def test_gaps_of_a_scene_are_reported_before_spectra_are_computed(line, message, command, tmp_path, monkeypatch, llvm):

@@ -4,17 +4,19 @@ import functools
 import io
 import math
 import re
+import time
 
 import mitsuba as mi
 import nbformat
+import pytest
 from nbclient import NotebookClient
 from rich.console import Console
 
 import mitsuba_diffraction as md
 from mitsuba_diffraction import progress
-from mitsuba_diffraction.settings import Settings
+from mitsuba_diffraction.settings import ScalarSettings
 
-RUBBED = {"profile": "xenopeltis", "size": 5.0, "patches": 3}
+RUBBED = {"profile": "xenopeltis_synthetic", "size": 5.0, "patches": 3}
 
 
 def test_a_log_reports_in_one_line_that_a_spectrum_is_computed(llvm, capfd, monkeypatch):
@@ -29,7 +31,9 @@ def test_a_log_reports_in_one_line_that_a_spectrum_is_computed(llvm, capfd, monk
 
 def test_progress_begins_with_the_heights_and_never_decreases():
     reports = []
-    md.Recipe(RUBBED, Settings(coherence_length=3.0, tolerance=0.05)).build(lambda *numbers: reports.append(numbers))
+    md.Recipe(RUBBED, ScalarSettings(coherence_length=3.0, tolerance=0.05)).build(
+        lambda *numbers: reports.append(numbers)
+    )
     done, total = zip(*reports, strict=True)
     assert set(total) == {100}
     assert list(done) == sorted(done)
@@ -50,6 +54,27 @@ def test_a_terminal_shows_a_bar_below_another(monkeypatch):
     for words in ("loading", "spectrum of elaphe", "3/7", "1/64 spp, error 0.25"):
         assert words in text
     assert not progress._bars
+
+
+def test_a_log_says_what_is_done_before_anything_can_be_counted(capsys, monkeypatch):
+    monkeypatch.setattr(progress, "_MIN_REPORTED_SECONDS", 0.05)
+    with progress.progress_bar("skin.toml", "%"), progress.stage("reading"):
+        time.sleep(0.5)
+    with progress.progress_bar("skin.toml", "%") as show:
+        show(3, 100)
+        capsys.readouterr()
+        time.sleep(0.2)
+    assert capsys.readouterr().err == ""
+    with progress.progress_bar("skin.toml", "%"), progress.stage("reading"):
+        time.sleep(0.5)
+    assert capsys.readouterr().err == "mitsuba-diffraction: skin.toml: reading\n"
+
+
+@pytest.mark.parametrize(
+    ("count", "text"), [(1.4, "0.0 kB"), (950e3, "950 kB"), (4.93e6, "4.9 MB"), (100e6, "100 MB"), (2.13e9, "2.1 GB")]
+)
+def test_bytes_are_written_without_powers_of_ten(count, text):
+    assert progress.bytes_text(count) == text
 
 
 def test_a_notebook_shows_a_line():

@@ -12,10 +12,13 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 import pytest
+from PIL import Image
 from scipy.special import j1
 
 import mitsuba_diffraction as md
+from mitsuba_diffraction import hologram as gratings_of
 from mitsuba_diffraction.render import render
+from mitsuba_diffraction.render import scene as of_scenes
 from mitsuba_diffraction.render.scene import load_spectral_scene
 
 ROOT = Path(__file__).parents[1]
@@ -80,7 +83,7 @@ def test_scene_of_transmitted_light_renders(llvm, name, parameters):
 @pytest.mark.slow
 def test_scene_of_a_scan_renders(llvm, tmp_path):
     path = tmp_path / "spectrum.exr"
-    md.precompute(md.gratings.elaphe(8)).save(path)
+    md.precompute(md.gratings.elaphe_synthetic(8)).save(path)
     check(render(SCENES / "scan.xml", spp=4, width=16, height=16, parameters={"spectrum": str(path)}), 16, 16)
 
 
@@ -118,7 +121,7 @@ def small_scenes(tmp_path_factory):
     disc.make(models, count=64)
     foil.make(models, count=60)
     ground.make(models, size=256)
-    hologram.make(models, hologram.PICTURE, np.array(hologram.LIGHT), np.array(hologram.EYE), count=32)
+    hologram.make(models, columns=32)
     anodised.make(models, columns=64)
     beetle.make(models, columns=90)
     return scenes
@@ -146,16 +149,6 @@ def test_scene_with_models_renders(llvm, small_scenes, name, parameters):
     check(render(small_scenes / f"{name}.xml", spp=4, width=32, parameters=parameters), 32, 18)
 
 
-def test_missing_models_are_named(llvm, tmp_path, command):
-    for part in ("foil.xml", "lights/sun.xml"):
-        (tmp_path / part).parent.mkdir(exist_ok=True)
-        shutil.copy(SCENES / part, tmp_path / part)
-    code, _, error = command("render", str(tmp_path / "foil.xml"), "-o", str(tmp_path / "x.exr"))
-    assert code == 2
-    assert re.search(r"models/\w+\.(ply|png|exr)", error)
-    assert error.count("\n") == 1
-
-
 def hit(small_scenes, name, origins, directions):
     """Where rays meet a mesh: Mitsuba's interaction, in the scalar variant one by one."""
     mi.set_variant("scalar_spectral")
@@ -170,19 +163,64 @@ def hit(small_scenes, name, origins, directions):
 
 def test_stripes_of_the_hologram_diffract_their_colours_from_the_lamp_to_the_eye():
     """By the grating equation; as bright as they should be by J_1²."""
-    light, eye = np.array(hologram.LIGHT), np.array(hologram.EYE)
+    light, eye = np.array(gratings_of.LIGHT), np.array(gratings_of.EYE)
     brightness = np.random.default_rng(0).random((4, 6, 3))
-    lateral, heights, turn = (x.ravel() for x in hologram.gratings(brightness, light, eye))
-    pixel = hologram.WIDTH / 18
+    lateral, heights, turn = (x.ravel() for x in gratings_of.stripes(brightness))
+    pixel = gratings_of.SIZE[0] / 18
     y, x = np.mgrid[:4, :18]
     points = np.stack([(x + 0.5) * pixel - 8, (1.5 - y) * 3 * pixel, 0 * x], -1).reshape(-1, 3)
-    to_light, to_eye = (hologram.directions(points, there) for there in (light, eye))
-    turn, wavelength = np.deg2rad(turn), np.tile(hologram.WAVELENGTHS, 24)
-    diffracted = (wavelength / (lateral * hologram.PERIOD))[:, None] * np.stack([np.cos(turn), np.sin(turn)], -1)
+    to_light, to_eye = (gratings_of.directions(points, there) for there in (light, eye))
+    turn, wavelength = np.deg2rad(turn), np.tile(gratings_of.STRIPE_WAVELENGTHS, 24)
+    diffracted = (wavelength / (lateral * gratings_of.PERIOD))[:, None] * np.stack([np.cos(turn), np.sin(turn)], -1)
     np.testing.assert_allclose(-to_light[:, :2] - diffracted, to_eye[:, :2], atol=1e-12)
     kappa = 2 * np.pi * (to_light[:, 2] + to_eye[:, 2]) / wavelength
-    fraction = j1(kappa * heights * hologram.DEPTH / 2) ** 2
+    fraction = j1(kappa * heights * gratings_of.DEPTH / 2) ** 2
     np.testing.assert_allclose(fraction / 0.3386, brightness.ravel(), atol=2e-3)
+
+
+def test_a_picture_keeps_its_proportions_in_the_middle_of_the_hologram(tmp_path):
+    """A portrait, its upper left quarter red and its lower right quarter transparent."""
+    picture = np.full((30, 20, 4), 255, np.uint8)
+    picture[:15, :10, 1:3] = 0
+    picture[15:, 10:, 3] = 0
+    Image.fromarray(picture).save(tmp_path / "portrait.png")
+    linear = gratings_of.fitted(tmp_path / "portrait.png", 64)
+    assert linear.shape == (36, 64, 3)
+    left, right = 20, 44  # 24 of 64 columns, as 36 · 20/30 = 24
+    assert not linear[:, :left].any()
+    assert not linear[:, right:].any()
+    np.testing.assert_allclose(linear[4:14, left + 2 : left + 8], np.full((10, 6, 3), [1, 0, 0]), atol=1e-9)
+    np.testing.assert_allclose(linear[4:14, right - 8 : right - 2], 1)
+    assert not linear[22:32, right - 8 : right - 2].any()
+    lateral, heights, _ = gratings_of.write(tmp_path / "portrait.png", tmp_path, columns=64)
+    assert heights.shape == (36, 192)
+    assert not heights[:, : 3 * left].any()
+    for path, values in zip(gratings_of.textures_in(tmp_path), (lateral, heights), strict=False):
+        # Mitsuba reads the first row of the file at v = 0, the bottom of the card.
+        np.testing.assert_allclose(np.squeeze(mi.Bitmap(str(path))), values[::-1], rtol=1e-3, atol=1e-4)
+    with pytest.raises(ValueError, match="got no picture, wanted one"):
+        gratings_of.fitted(SCENES / "hologram.xml", 64)
+
+
+def test_models_are_made_when_a_scene_is_first_read(tmp_path, monkeypatch):
+    """By the scripts of the package, not by those beside the scene; files that exist are kept."""
+    package, own = tmp_path / "package" / "scenes", tmp_path / "scenes"
+    package.mkdir(parents=True)
+    (package / "disc.py").write_text(
+        "def make(folder):\n    for name in 'ab':\n        (folder / f'{name}.png').write_text(name)\n"
+    )
+    (own / "models").mkdir(parents=True)
+    (own / "disc.py").write_text("raise SystemExit('this must not run')")
+    (own / "models" / "b.png").write_text("mine")
+    texture = '<texture type="bitmap" id="t"><string name="filename" value="models/a.png"/></texture>'
+    scene = own / "scene.xml"
+    scene.write_text(f'<scene version="3.0.0"><!-- made by: python scenes/disc.py -->{texture}</scene>')
+    monkeypatch.setattr(of_scenes, "examples_folder", lambda: package.parent)
+    assert scene in of_scenes.files_of_scene(scene)
+    assert [(own / "models" / f"{name}.png").read_text() for name in "ab"] == ["a", "mine"]
+    scene.write_text(scene.read_text().replace("a.png", "c.png"))
+    with pytest.raises(ValueError, match=r"models/c.png: no such file; it is made by: python scenes/disc.py"):
+        of_scenes.files_of_scene(scene)
 
 
 # ---------------------------------------------------------------- the beetle

@@ -11,110 +11,134 @@ import mitsuba as mi
 from ..errors import RequestError
 from ..manual import Parameter, listed
 from ..materials import DISPERSION
-from ..recipe import Recipe, parameters_of_profile
-from ..surface.gratings import PROFILES
+from ..recipe import MAX_PATCHES, Recipe, parameters_of_profile
+from ..surface.gratings import PROFILES, RENAMED
 from .base import base_from, living
 from .layers import Layers
 from .parameters import GratingRequest
 from .thin_film import MAX_THICKNESS
 
 PARAMETERS = (
-    Parameter("filename", "string", "a saved spectrum (.exr) or a recipe (.toml)"),
-    Parameter("spectrum", "GratingSpectrum or RigorousSpectrum", "a spectrum from Python, in load_dict"),
+    Parameter(
+        "filename",
+        "string",
+        "a spectrum file (`.exr`), or a recipe (`.toml`) whose spectrum is computed once and "
+        "[cached](commands.md#caches-and-damaged-files), or the [name](commands.md#names-of-surfaces) of a profile or "
+        "recipe of the package",
+    ),
+    Parameter("spectrum", "GratingSpectrum or RigorousSpectrum", "a spectrum from Python, in `load_dict` only"),
     Parameter(
         "profile",
         "string",
-        "an analytic surface instead of a file, with the parameters of the function of that name in "
-        "`mitsuba_diffraction.gratings`, lengths in µm, and coherence_length and largest_height_range as in "
-        "`precompute`",
+        f"an analytic surface instead of a file, one of {', '.join(f'`{name}`' for name in PROFILES)}. It takes the "
+        "parameters of the function of that name in `mitsuba_diffraction.gratings`, with lengths in µm, and "
+        "`coherence_length` and `largest_height_range` as in `precompute`. For a random surface (one with a `seed`), "
+        "`patches` is the number of seeds over which the spectrum is averaged, by default 48 for discs and 16 for the "
+        f"others, at most {MAX_PATCHES}",
     ),
-    Parameter("tolerance", "float", "of the spectrum of a profile or a recipe, as in `precompute`"),
+    Parameter(
+        "tolerance",
+        "float",
+        "tolerance of the spectrum, as in `precompute`; for a profile, or for a recipe, whose value it replaces",
+    ),
     Parameter(
         "representation",
         "string",
-        "how the powers of orders are stored: slices (default) or, for one tile, a series of the amplitudes, taylor or "
-        "chebyshev",
+        "for a profile or recipe, how the powers of orders are stored: as `slices` (default) or, for one tile, by a "
+        "[series of the amplitudes](theory.md#tables), `taylor` or `chebyshev`",
     ),
     Parameter(
         "terms",
         "integer or string",
-        "number of terms of a series, or auto (default): as many as the tolerance needs. An error above the tolerance "
-        "is logged, and one of all light or more is refused, unless tolerance, then also above 1, allows it",
+        "number of terms of a series, or `auto` (default): as many as the tolerance needs. An error above the "
+        "tolerance is logged; an error of all light or more is refused, unless `tolerance`, then also above 1, allows "
+        "it",
     ),
-    Parameter("heights_from", "string", "for a series, the level of h = 0: mean (default) or lowest"),
+    Parameter(
+        "heights_from",
+        "string",
+        "for a series, the level of h = 0: `mean` (default), or `lowest`, as in the shader of 2014",
+    ),
     Parameter(
         "theory",
         "string",
-        "for a profile: scalar, or rigorous, Maxwell's equations for line gratings in the given material; files and "
-        "spectra specify their own. Rigorous theory refuses height_scale, lateral_scale, shadowing and base",
+        "theory used for a `profile`: `scalar`, or `rigorous`, Maxwell's equations for line gratings in the given "
+        "material; files and spectra specify their own. Rigorous theory has no scales, films, shadowing and base",
         "scalar",
     ),
     Parameter(
         "int_ior, ext_ior",
         "float or string",
-        "a dielectric, as in Mitsuba's `dielectric`; int_ior also a medium with dispersion "
-        f"({', '.join(DISPERSION)}) or the file of a table (.spd, .csv, .yml)",
+        "a dielectric: a number or a name, as in Mitsuba's `dielectric`; `int_ior` also a [medium with dispersion or a "
+        f"file](#refractive-indices): {', '.join(f'`{name}`' for name in DISPERSION)}, or a table (`.spd`, `.csv`, "
+        "`.yml`)",
         "1.5, air",
     ),
     Parameter(
         "material",
         "string",
-        'a conductor instead, as in Mitsuba\'s `conductor`, or Ti, or the file of a table; "none" is the perfect '
-        "mirror, R = 1",
+        "a conductor instead: a name as in Mitsuba's `conductor`, or `Ti` (Johnson and Christy 1974), or a "
+        "[file](#refractive-indices), or `none` for a perfect mirror, R = 1",
     ),
-    Parameter("eta, k", "float, spectrum or texture", "the index η + ik of a conductor instead, k is 0 by default"),
+    Parameter(
+        "eta, k",
+        "float, spectrum or texture",
+        "the index η + ik of a conductor instead, as in Mitsuba's `conductor`; `k` is 0 by default",
+    ),
     Parameter(
         "thin_film_thickness",
         "float, texture or string",
-        "thickness of a film on the relief, µm along the normal; a string is the file of a picture, whose integers are "
-        "from 0 (black) to 1 µm (white), or a list of the thicknesses of several films, from the outside in, at most "
-        f"{MAX_THICKNESS:g} in all. Scalar theory only",
+        "thickness of a [film on the relief](#a-thin-film), µm along the normal; a string is the file of a picture, "
+        "whose integers are from 0 (black) to 1 µm (white), or a list of the thicknesses of [several "
+        f"films](#a-stack-of-films), from the outside in, at most {MAX_THICKNESS:g} in all. Scalar theory only",
         "0",
     ),
     Parameter(
         "thin_film_ior",
         "float or string",
-        "index of the film, as int_ior, or as material; or a list of as many indices, such as 2.35, 1.38, 2.35 or "
-        "8 x (2.35, 1.38)",
+        "index of the film: a number, a name or a file, as for `int_ior` or `material`; or a list of as many indices, "
+        "such as `2.35, 1.38, 2.35` or `8 x (2.35, 1.38)`",
         "none",
     ),
     Parameter("thin_film_scale", "float, texture or string", "factor of the thickness of all films", "1"),
     Parameter(
         "orientation",
         "float, texture or string",
-        "degrees from the tangent dp_du to the pattern's x axis; radial: x points away from the centre (0.5, 0.5) of "
-        "UV space; tangential: x runs around it; or the file of a picture, of integers from 0° (black) to 360° (white)",
+        "angle from the tangent dp/du to the pattern's x axis, degrees; `radial`: x points away from the centre (0.5, "
+        "0.5) of UV space; `tangential`: x runs around it; or the file of a picture, of integers from 0° (black) to "
+        "360° (white)",
         "0",
     ),
     Parameter("height_scale", "float, texture or string", "scales the heights; a string is the file of a picture", "1"),
     Parameter(
         "lateral_scale",
         "float, texture or string",
-        "scales the lengths along the surface, but not the width of lobes; for orders that do not overlap",
+        "scales the lengths along the surface by s: orders of a period T lie at m/(sT), and the width of lobes is "
+        "unchanged; for orders that do not overlap",
         "1",
     ),
-    Parameter("shadowing", "string", "shadowing and masking, G: v_cavity or none", "v_cavity"),
-    Parameter("conserve_energy", "boolean", "false leaves out E, to compare with closed forms", "true"),
+    Parameter("shadowing", "string", "shadowing and masking, G: `v_cavity` or `none`", "v_cavity"),
+    Parameter("conserve_energy", "boolean", "false leaves out the factor E, to compare with closed forms", "true"),
     Parameter(
         "coat_ior",
         "float or string",
-        "index of a clear plane layer over the grating, as for int_ior; no layer if it equals that of the outside",
+        "index of a clear plane layer over the grating, as for `int_ior`; no layer if it equals that of the outside",
         "none",
     ),
     Parameter(
         "transmission",
         "string",
-        "light that enters a dielectric: none, it is absorbed or reaches the base; interface, it enters the medium of "
-        "int_ior, as in `roughdielectric`; sheet, it is transmitted by a film whose lower face is flat, with ext_ior "
-        "above and below. A rigorous spectrum must be built for it",
+        "light that enters a dielectric: `none`, it is absorbed or reaches the base; `interface`, it enters the medium "
+        "of `int_ior`, as in `roughdielectric`; `sheet`, it is transmitted by a film whose lower face is flat, with "
+        "`ext_ior` on both sides. A rigorous spectrum must be built for it",
         "none",
     ),
     Parameter(
         "base",
         "BSDF, float or string",
-        "layer below a dielectric surface (pigment): any BSDF that only reflects; a number or a colour such as #a0522d "
-        "means a diffuse one. It is multiplied by (1 − R_i)(1 − R_o), with R at the angles of ω_i and ω_o to the "
-        "shading normal",
+        "layer below a dielectric surface (pigment): any BSDF that reflects and does not transmit; a number or a "
+        "colour such as `#a0522d` means a diffuse one. It is multiplied by (1 − R_i)(1 − R_o), with R at the angles of "
+        "ω_i and ω_o to the shading normal",
         "none",
     ),
 )
@@ -132,10 +156,10 @@ first edge of each triangle and is discontinuous: add UVs. Where dp_du vanishes,
 The BRDF is R · K · G · S(q; κ)/λ² · E, with q = −(ω_i + ω_o)_∥/λ along the pattern's axes and
 κ = 2π (cos θ_i + cos θ_o)/λ. R is the power reflectance at the half vector (`fresnel.py`, with a film `thin_film.py`),
 K, G and the gain Γ of orders are computed in `geometry.py`, S in `orders.py` (orders) or `continuum.py` (a lattice). E
-(`energy.py`) bounds the albedo by about one. Without shadowing there is no E, as K diverges near the horizon. In
+(`energy_factor.py`) bounds the albedo by about one. Without shadowing there is no E, as K diverges near the horizon. In
 rigorous theory the BRDF is Σ_m η_m Γ N(q − m/T; σ_q² I)/λ² (`rigorous_orders.py`).
 
-With transmission (`geometry.py`), light is incident from above or below; transmitted light has the factor n_o², where
+With transmission (`directions.py`), light is incident from above or below; transmitted light has the factor n_o², where
 n_o is the index of the medium of ω_o, and T instead of R. The flat face of a sheet reflects light from below
 specularly; in rigorous theory its reflections are part of the efficiencies. Under a coat (`coat.py`) all this holds for
 the wavelengths and directions inside it, and its front face reflects specularly. A saved spectrum must cover the
@@ -155,7 +179,7 @@ def refuse_wrong(props: mi.Properties) -> None:
     """
     types = {name: parameter.type for parameter in PARAMETERS for name in parameter.name.split(", ")}
     kinds, objects, profile = mi.Properties.Type, dict(props.objects()), props.get("profile")
-    is_known = isinstance(profile, str) and profile in PROFILES
+    is_known = isinstance(profile, str) and (profile := RENAMED.get(profile, profile)) in PROFILES
     nested = {name for name, value in objects.items() if isinstance(value, mi.BSDF)}  # `base_from` names others
     # `surface_from` lists the profiles.
     known = {*types, *(parameters_of_profile(profile) if is_known else ())}

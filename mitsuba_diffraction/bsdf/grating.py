@@ -12,11 +12,11 @@ import numpy as np
 from ..errors import RequestError
 from ..progress import progress_bar
 from ..recipe import Recipe
-from .energy import Coordinates
-from .geometry import Geometry, Incidence, Interface, rotated
+from .device_tables import BELOW_ONE, larger, limited, opaque, smaller
+from .directions import Geometry, Incidence, Interface, rotated
+from .energy_factor import Coordinates
 from .parameters import GratingRequest
 from .polarisation import reflected, through_layer
-from .tables import BELOW_ONE, larger, limited, opaque, smaller
 from .theory import theory_of
 from .varying import check_texture
 
@@ -50,7 +50,7 @@ class Grating:
         # Mitsuba's own object does not outlive the construction of the plugin.
         self._props, self._request = mi.Properties(props), request
         # The grating is black at angles that the spectrum does not cover.
-        self.min_cosine = opaque(np.cos(np.deg2rad(self.spectrum.largest_angle)) * (1 - 1e-6))
+        self.min_cosine = opaque(np.cos(np.deg2rad(self.theory.largest_angle)) * (1 - 1e-6))
 
     @property
     def interface(self) -> Interface:

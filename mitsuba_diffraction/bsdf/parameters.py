@@ -16,15 +16,23 @@ from ..errors import RequestError, is_number
 from ..geometry import SHADOWING
 from ..materials import RefractiveIndex, is_file
 from ..precomputation import Spectrum, load_spectrum
-from ..recipe import REQUESTED, Recipe
-from ..rigorous.spectrum import RigorousSpectrum
-from ..settings import FROM_RADIUS, MIN_WAVELENGTH, THEORIES, TRANSMISSIONS, VISIBLE, wavelengths_inside
+from ..recipe import REQUESTED, Recipe, source_named
+from ..rigorous.rigorous_spectrum import RigorousSpectrum
+from ..settings import (
+    FROM_RADIUS,
+    MIN_WAVELENGTH,
+    THEORIES,
+    TRANSMISSIONS,
+    VISIBLE,
+    RigorousSettings,
+    wavelengths_inside,
+)
 from ..surface.gratings import PROFILES
 from .base import nested_plugin
 from .coat import SAME_INDEX, Coat, coat_from
+from .device_tables import larger
 from .fresnel import Conductor, Material, PerfectMirror, SpectralConductor, reflectance_from
 from .indices import absolute_index, index_from
-from .tables import larger
 from .thin_film import with_film
 from .varying import VaryingNumber, check_texture, numbers_from
 
@@ -214,10 +222,7 @@ def surface_from(props: mi.Properties, media: Media, scale: float = 1.0) -> Spec
             raise RequestError(
                 f"spectrum: got {props['spectrum']!r}, wanted a spectrum in Python's load_dict; XML takes a filename"
             )
-        if isinstance(surface, Recipe):
-            found = surface.settings.theory
-        else:
-            found = "rigorous" if isinstance(surface, RigorousSpectrum) else "scalar"
+        found = surface.settings.theory if isinstance(surface, Recipe) else surface.theory
         if props.get("theory", found) != found:
             raise RequestError(f"theory: got {theory!r} with a spectrum of {found} theory, wanted one built for it")
         return surface
@@ -239,7 +244,7 @@ def _inside(props: mi.Properties, media: Media, scale: float, recipe: Recipe) ->
     Parameters that do not match the recipe are refused here, before a table is computed.
     """
     settings, overrides = recipe.settings, dict[str, Any]()
-    if settings.theory == "rigorous":
+    if isinstance(settings, RigorousSettings):
         refuse_scalar_only(props)
         if settings.transmission != "none":
             check_transmission(settings.transmission, media)
@@ -266,6 +271,10 @@ def _from_file(props: mi.Properties, media: Media, scale: float) -> Spectrum | R
     """Return the spectrum or the recipe of a file."""
     path = Path(str(mi.file_resolver().resolve(str(props["filename"]))))
     given = _requested(props)
+    if not path.suffix:
+        path = Path(source_named(str(path)))
+        if str(path) in PROFILES:
+            return _inside(props, media, scale, Recipe.of_profile(str(path), given))
     suffix = path.suffix.lower()
     if suffix in (".toml", ".exr") and not path.is_file():
         # An unresolved path is relative; the resolver begins with the folder of the scene.

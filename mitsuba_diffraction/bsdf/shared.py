@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import threading
 import weakref
-from typing import cast
+from collections.abc import Callable, Hashable
+from typing import Any, TypeVar, cast
 
 import drjit as dr
 import mitsuba as mi
@@ -12,28 +13,39 @@ import numpy as np
 
 from ..energy.table import EnergyTable
 from ..grating_spectrum import GratingSpectrum
-from ..precomputation import Spectrum
-from ..rigorous.spectrum import RigorousSpectrum
 from ..settings import VISIBLE
 from ..spectrum.grids import OrderGrid
 from ..stack import Stack
 from .continuum import SplineSpectrum
-from .energy import Energy
+from .energy_factor import Energy
 from .order_sampler import OrderSampler
 from .orders import OrderSpectrum
 from .parameters import Scales
-from .rigorous_orders import RigorousOrders
 
-MAX_PHASE_STEP = 0.5  # radians at the deepest point, between nodes of the ratio of scales in a table of E
+MAX_NODE_PHASE_STEP = 0.5  # radians at the deepest point, between nodes of the ratio of scales in a table of E
 MAX_RATIOS = 16  # number of these nodes
 SAMPLER_RATIOS = 7  # number of ratios of varying scales; `OrderSampler` has bins for each interval between two
 
 _making = threading.Lock()
-_shared: weakref.WeakValueDictionary[tuple[str, str, Stack | None], SharedTables] = weakref.WeakValueDictionary()
+_shared: weakref.WeakValueDictionary[Hashable, Any] = weakref.WeakValueDictionary()
+
+Tables = TypeVar("Tables")
+
+
+def shared(key: Hashable, make: Callable[[], Tables]) -> Tables:
+    """Return the tables of a key (variant, digest, …) that a BSDF holds, or else new ones.
+
+    Mitsuba constructs plugins on several threads: one of them makes the tables while the others wait.
+    """
+    with _making:
+        tables = _shared.get(key)
+        if tables is None:
+            tables = _shared[key] = make()
+        return cast(Tables, tables)
 
 
 class SharedTables:
-    """The tables of one spectrum for all BSDFs that have it, in one variant of Mitsuba.
+    """The tables of one spectrum of scalar theory for all BSDFs that have it, in one variant of Mitsuba.
 
     Attributes:
         table: the powers and their sampler. For resolved orders there is no sampler here, as it depends on the scene.
@@ -41,16 +53,12 @@ class SharedTables:
         max_scale: the maximum lateral scale for which orders are resolved; None if they overlap without scaling.
     """
 
-    def __init__(self, spectrum: Spectrum, stack: Stack | None) -> None:
-        self.table: OrderSpectrum | SplineSpectrum | RigorousOrders
-        if isinstance(spectrum, RigorousSpectrum):
-            self.table = RigorousOrders(spectrum)
-        else:
-            # Above κ of nearly all transmitted light: 1.5 times κ of undiffracted light along the normal, at the
-            # shortest visible wavelength.
-            max_kappa = None if stack is None else 3 * np.pi * abs(stack.nominal - 1) / (VISIBLE[0] * 1e-3)
-            kind = OrderSpectrum if isinstance(spectrum.grid, OrderGrid) else SplineSpectrum
-            self.table = kind(spectrum, max_kappa)
+    def __init__(self, spectrum: GratingSpectrum, stack: Stack | None) -> None:
+        # Above κ of nearly all transmitted light: 1.5 times κ of undiffracted light along the normal, at the shortest
+        # visible wavelength.
+        max_kappa = None if stack is None else 3 * np.pi * abs(stack.nominal - 1) / (VISIBLE[0] * 1e-3)
+        kind = OrderSpectrum if isinstance(spectrum.grid, OrderGrid) else SplineSpectrum
+        self.table: OrderSpectrum | SplineSpectrum = kind(spectrum, max_kappa)
         self.max_scale: float | None = None
         if isinstance(self.table, OrderSpectrum) and self.table.resolved:
             self.max_scale = self.table.max_scale
@@ -60,32 +68,24 @@ class SharedTables:
         self._lock = threading.Lock()
 
     @classmethod
-    def of(cls, spectrum: Spectrum, stack: Stack | None = None) -> SharedTables:
+    def of(cls, spectrum: GratingSpectrum, stack: Stack | None = None) -> SharedTables:
         """Return the tables that a BSDF with an equal spectrum holds, or else new ones.
 
         `stack` is the material of a grating that transmits light, with its films.
-
-        Mitsuba constructs plugins on several threads: one of them makes the tables while the others wait.
         """
-        key = mi.variant(), spectrum.digest, stack
-        with _making:
-            tables = _shared.get(key)
-            if tables is None:
-                tables = _shared[key] = cls(spectrum, stack)
-            return tables
+        return shared((mi.variant(), spectrum.digest, stack), lambda: cls(spectrum, stack))
 
     def scattering(self, scales: Scales, is_sheet: bool, coat_index: float) -> OrderSpectrum | SplineSpectrum:
         """Return the powers of scalar theory and their sampler, for the media and scales of a scene."""
-        table = cast(OrderSpectrum | SplineSpectrum, self.table)
-        if not table.resolved:
-            return table
+        if not self.table.resolved:
+            return self.table
         low, high = scales.ratios()
         ratios = np.linspace(low, high, 1 if low == high else SAMPLER_RATIOS)
         key = is_sheet, coat_index, ratios.tolist(), scales.laterals
         with self._lock:
             if self._drawn is None or self._drawn[0] != key:
-                sampler = OrderSampler(cast(GratingSpectrum, self._spectrum), self.stack, *key)
-                self._drawn = key, cast(OrderSpectrum, table).drawn_by(sampler)
+                sampler = OrderSampler(self._spectrum, self.stack, *key)
+                self._drawn = key, cast(OrderSpectrum, self.table).drawn_by(sampler)
             return self._drawn[1]
 
     def energy(self, scales: Scales) -> Energy | None:
@@ -93,8 +93,8 @@ class SharedTables:
 
         E is linear between nodes of the ratio of scales where that varies or has a gradient.
         """
-        spectrum, (low, high) = cast(GratingSpectrum, self._spectrum), scales.ratios()
-        per_step = spectrum.max_kappa * spectrum.height_range / MAX_PHASE_STEP
+        spectrum, (low, high) = self._spectrum, scales.ratios()
+        per_step = spectrum.max_kappa * spectrum.height_range / MAX_NODE_PHASE_STEP
         if low == high and not scales.height.varies and dr.grad_enabled(scales.height.value):
             # Wide enough for differences of values that are stored as bytes.
             half = 1 / max(per_step, 10)

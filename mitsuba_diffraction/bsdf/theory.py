@@ -6,7 +6,7 @@ import contextlib
 import functools
 import logging
 from collections.abc import Iterator
-from typing import Protocol, cast
+from typing import Protocol
 
 import drjit as dr
 import mitsuba as mi
@@ -17,19 +17,19 @@ from ..errors import RequestError
 from ..geometry import SHADOWING
 from ..grating_spectrum import GratingSpectrum
 from ..precomputation import Spectrum
-from ..rigorous.spectrum import RigorousSpectrum
+from ..rigorous.rigorous_spectrum import RigorousSpectrum
 from ..settings import VISIBLE
 from ..stack import Stack
 from .coat import SAME_INDEX, Coat
-from .energy import Coordinates, Energy
+from .device_tables import opaque
+from .directions import Geometry, Incidence, Interface, rotated
+from .energy_factor import Coordinates, Energy
 from .fresnel import Material
-from .geometry import Geometry, Incidence, Interface, rotated
 from .order_sampler import MAX_INDEX_CHANGE, OrderSampler
 from .parameters import GratingRequest, Media, check_parameters, check_transmission
 from .polarisation import Split, of_facets, of_orders
 from .rigorous_orders import RigorousOrders
-from .shared import SharedTables
-from .tables import opaque
+from .shared import SharedTables, shared
 
 MAX_FILM_CHANGE = 5e-4  # µm, of a film, up to which a table is reused
 _log = logging.getLogger(__name__)
@@ -108,6 +108,7 @@ class Theory(Protocol):
         media: those around the grating.
         shadowing: whether G is a factor.
         wavelengths: (shortest, longest) of the table, in air, nm.
+        largest_angle: from the normal, of both directions, degrees.
         light: (shortest, longest) of the light that was taken by `cover`, in air, nm; None before there is a scene.
     """
 
@@ -117,6 +118,7 @@ class Theory(Protocol):
     media: Media
     shadowing: bool
     wavelengths: tuple[float, float]
+    largest_angle: float = 90.0
     light: tuple[float, float] | None = None
 
     def cover(self, wavelengths: tuple[float, float]) -> None:
@@ -192,7 +194,7 @@ class ScalarTheory(Theory):
         _check_error(spectrum)
         self.spectrum, self.media, self.scales = spectrum, request.media, request.scales
         self.material, self.shadowing = request.material, request.shadowing
-        self.conserve_energy = request.conserve_energy
+        self.conserve_energy, self.largest_angle = request.conserve_energy, spectrum.largest_angle
         self.update()
 
     def cover(self, wavelengths: tuple[float, float]) -> None:
@@ -340,7 +342,7 @@ class RigorousTheory(Theory):
             raise RequestError(f"ext_ior: got {media.outside:g} with theory=rigorous, wanted air or a coat")
         check_transmission(spectrum.transmission, media)
         self.material = check_parameters(props, spectrum, coat)
-        self.scattering = cast(RigorousOrders, SharedTables.of(spectrum).table)
+        self.scattering = shared((mi.variant(), spectrum.digest), lambda: RigorousOrders(spectrum))
         if media.eta is None:
             self.interface = _of_coat(coat)
         else:

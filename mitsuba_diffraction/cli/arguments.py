@@ -7,7 +7,6 @@ import inspect
 import os
 from collections.abc import Callable, Iterable, Sequence
 from contextlib import suppress
-from dataclasses import fields
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -18,8 +17,8 @@ from numpy.typing import NDArray
 from ..errors import RequestError
 from ..files import refuse_other_than_utf8
 from ..progress import say
-from ..recipe import Recipe
-from ..settings import SUN_COHERENCE_LENGTH, Settings
+from ..recipe import Recipe, source_named
+from ..settings import SPECTRUM_PARAMETERS, SUN_COHERENCE_LENGTH, Settings
 from ..surface.gratings import PROFILES
 from ..surface.prepare import STEP_NAMES, step_of
 
@@ -63,14 +62,14 @@ def check_suffix(option: str, path: Path, *suffixes: str) -> None:
 
 
 def surface_of(text: str) -> tuple[str, dict[str, Value]]:
-    """Return source and parameters from RECIPE|PROFILE[,name=value…]; numbers, true and false are converted."""
+    """Return source, as `source_named`, and parameters from SURFACE[,name=value…]; numbers and booleans converted."""
     source, *items = text.split(",")
     values: dict[str, Value] = {}
     for name, equals, value in (item.strip().partition("=") for item in items):
         if not (name and equals and value) or name in values:
             raise RequestError(f"{text}: got {name + equals + value!r}, wanted name=value, each name once")
         values[name] = converted(value)
-    return source, values
+    return source_named(source), values
 
 
 def is_scan(source: str) -> bool:
@@ -80,7 +79,7 @@ def is_scan(source: str) -> bool:
     return is_file and source not in PROFILES and path.suffix.lower() not in (".toml", ".exr")
 
 
-def numbers(option: str, text: str) -> NDArray[np.float64]:
+def parse_numbers(option: str, text: str) -> NDArray[np.float64]:
     """Return the numbers in "30", "0,30,60" or "0:60:5" (60 included), (n,), at most 10,000."""
     try:
         if ":" not in text:
@@ -95,8 +94,8 @@ def numbers(option: str, text: str) -> NDArray[np.float64]:
 
 
 def angles_of(option: str, text: str) -> NDArray[np.float64]:
-    """Return angles from the normal in degrees, (n,), given as `numbers`."""
-    found = numbers(option, text)
+    """Return angles from the normal in degrees, (n,), given as in `parse_numbers`."""
+    found = parse_numbers(option, text)
     if (wrong := found[~(np.abs(found) < 90)]).size:
         raise RequestError(f"{option}: got {wrong[0]:g}, wanted degrees above −90 and below 90")
     return found
@@ -115,9 +114,9 @@ def materials_of(texts: Sequence[str] | None) -> dict[str, dict[str, Value]]:
     materials: dict[str, dict[str, Value]] = {}
     for text in texts or []:
         name, equals, rest = text.partition("=")
+        if not (name and equals and rest.partition(",")[0]):
+            raise RequestError(f"--material: got {text!r}, wanted ID=SURFACE[,name=value…]")
         source, values = surface_of(rest)
-        if not (name and equals and source):
-            raise RequestError(f"--material: got {text!r}, wanted ID=RECIPE|PROFILE[,name=value…]")
         if name in materials:
             raise RequestError(f"--material {name}: got it twice, wanted one grating")
         is_file = Path(source).suffix.lower() in (".toml", ".exr")
@@ -187,8 +186,8 @@ def options_of_scan(context: typer.Context) -> dict[str, object]:
 
 
 def settings_of(context: typer.Context) -> dict[str, Any]:
-    """Return the given options of the spectrum, under their names in `Settings`."""
-    given = given_of(context, [field.name for field in fields(Settings)])
+    """Return the given options of the spectrum, by name."""
+    given = given_of(context, SPECTRUM_PARAMETERS)
     return {name: converted(value) if name == "int_ior" else value for name, value in given.items()}
 
 
@@ -199,12 +198,16 @@ def given_of(context: typer.Context, names: Iterable[str]) -> dict[str, Any]:
 
 
 def recipe_of(source: Path, of_scan: dict[str, Any], settings: dict[str, Any], extent: str = "sample") -> Recipe:
-    """Return the recipe in a file, or a recipe of a scan; `settings` override a file's settings and a scan's extent.
+    """Return the recipe in a file, of a profile, or of a scan; `settings` override its own, and a scan's extent.
 
     Scans are samples by default, as they are rarely cut to whole periods.
     """
+    if str(source) in PROFILES:
+        if of_scan:
+            raise RequestError(f"{source}: got {', '.join(of_scan)} of a profile, wanted them of a scan")
+        return Recipe.of_profile(str(source), {}, **settings)
     if source.suffix.lower() != ".toml":
-        return Recipe({"scan": source.name, **of_scan}, Settings(**{"extent": extent, **settings}), source.parent)
+        return Recipe({"scan": source.name, **of_scan}, Settings.of(**{"extent": extent, **settings}), source.parent)
     if of_scan:
         names = ", ".join(f"--{name.replace('_', '-')}" for name in of_scan)
         raise RequestError(f"{names} go with a scan; the recipe {source} has its own")

@@ -16,7 +16,7 @@ from ..peaks import check_request, peak_efficiencies
 from ..precomputation import load_spectrum
 from ..progress import progress_bar, tell
 from ..recipe import Recipe, parameters_of_profile
-from ..settings import Settings
+from ..settings import ScalarSettings
 from .arguments import (
     Overwrite,
     Value,
@@ -24,8 +24,8 @@ from .arguments import (
     check_suffix,
     converted,
     is_scan,
-    numbers,
     options_of_scan,
+    parse_numbers,
     recipe_of,
     settings_of,
     surface_of,
@@ -68,7 +68,7 @@ def efficiency(
     overwrite: Overwrite = False,
 ) -> None:
     """Compute how much light goes into each order of a grating, or each spectral peak of an irregular surface."""
-    angles, wavelengths = angles_of("--angle", angle), numbers("--wavelength", wavelength)
+    angles, wavelengths = angles_of("--angle", angle), parse_numbers("--wavelength", wavelength)
     name, values = surface_of(source)
     of_scan, given = options_of_scan(context), settings_of(context)
     of_spectrum: dict[str, Any] = {key: given[key] for key in ("extent", "coherence_length") if key in given}
@@ -77,11 +77,12 @@ def efficiency(
         recipe = _recipe(name, values, of_scan, of_spectrum)
     elif options := ", ".join([*values, *of_scan, *of_spectrum]):
         raise RequestError(f"{name}: got {options} with a saved spectrum, wanted the recipe or the scan itself")
-    settings = Settings() if recipe is None else recipe.settings
-    theory, transmission = theory or settings.theory, transmission or settings.transmission
+    settings = ScalarSettings() if recipe is None else recipe.settings
+    chosen = settings.chosen
+    theory, transmission = theory or settings.theory, transmission or chosen.get("transmission", "none")
     index: complex | str | None = None if int_ior is None else converted(int_ior)
     if material is None and int_ior is None:
-        material, index = settings.material, settings.int_ior
+        material, index = chosen.get("material"), chosen.get("int_ior")
     if csv is not None:
         check_suffix("--csv", csv, ".csv")
     if plot is not None:

@@ -8,11 +8,10 @@ from typing import Annotated
 import typer
 
 from ..errors import RequestError
-from ..files import whole_file
+from ..files import examples_folder, whole_file
 from ..progress import tell
 from .arguments import Overwrite
 
-_PACKAGE = Path(__file__).parents[1]
 _OUTPUT_FOLDERS = {"models", "out", "__pycache__"}
 """Folders in a checkout that hold outputs of scripts and renderings."""
 
@@ -22,7 +21,7 @@ def examples(
     overwrite: Overwrite = False,
 ) -> None:
     """Copy the scenes, recipes and measured skins that the package contains."""
-    root = source()
+    root = examples_folder()
     contents = {folder / path: (root / path).read_bytes() for path in _files(root)}
     new = {
         target: content
@@ -37,17 +36,6 @@ def examples(
         with whole_file(target) as temporary:
             temporary.write_bytes(content)
     tell(f"{folder}: {len(contents)} files, described in scenes/README.md and precompute/README.md")
-
-
-def source() -> Path:
-    """Return the folder that holds the scenes and recipes of the package.
-
-    In a checkout they are beside the package; setup.py copies them into it.
-    """
-    for root in (_PACKAGE / "examples", _PACKAGE.parent):
-        if (root / "scenes").is_dir():
-            return root
-    raise RuntimeError(f"{_PACKAGE}: the package was installed without its scenes and recipes")
 
 
 def _files(root: Path) -> list[Path]:

@@ -15,9 +15,10 @@ from rich.text import Text
 from ..errors import RequestError
 from ..inspection import Inspection, save_picture
 from ..inspection import inspect as look
-from ..inspection.colours import GREEN, Colour, colours_at
+from ..inspection.predicted_colours import GREEN, Colour, colours_at
 from ..outputs import check_outputs, free_name, plain, save_json
 from ..progress import progress_bar, show, table, tell
+from ..recipe import source_named
 from ..settings import SUN_COHERENCE_LENGTH, lobe_width
 from .arguments import (
     Overwrite,
@@ -33,7 +34,7 @@ from .arguments import (
 @takes_scan
 def inspect(
     context: typer.Context,
-    source: Annotated[Path, typer.Argument(metavar="SCAN|RECIPE", help="a scan, or a recipe (.toml)")],
+    source: Annotated[Path, typer.Argument(metavar="SURFACE", help="a scan, a recipe (.toml), or a profile")],
     output: Annotated[
         Path | None,
         typer.Option("-o", "--output", help="figure (.png, .pdf, .svg); default: ./NAME_inspect.png"),
@@ -53,6 +54,7 @@ def inspect(
     angles, views = angles_of("--angle", angle), np.zeros(0) if view is None else angles_of("--view", view)
     if view is None and angle != "0":
         raise RequestError(f"--angle: got {angle} without --view, wanted the angles of the viewer, too")
+    source = Path(source_named(str(source)))
     recipe = recipe_of(source, options_of_scan(context), settings_of(context))
     reads = [source, *recipe.files]
     default_name = free_name(f"{source.stem}_inspect", lambda stem: [Path(f"{stem}.png")], reads)

@@ -1,4 +1,4 @@
-"""`mitsuba-diffraction precompute`: a spectrum file from a recipe or a scan."""
+"""`mitsuba-diffraction precompute`: a spectrum file from a recipe, a profile or a scan."""
 
 from __future__ import annotations
 
@@ -8,12 +8,9 @@ from typing import Annotated
 import typer
 
 from ..errors import RequestError
-from ..grating_spectrum import GratingSpectrum
 from ..outputs import check_outputs
-from ..precomputation import Spectrum
 from ..progress import durations, progress_bar, stage, tell
-from ..recipe import Recipe
-from ..rigorous.spectrum import RigorousSpectrum
+from ..recipe import Recipe, source_named
 from ..settings import ORIGINS, REPRESENTATIONS, SUN_COHERENCE_LENGTH, THEORIES
 from ..surface.prepare import is_seam_visible, seam_steps
 from .arguments import (
@@ -29,7 +26,7 @@ from .arguments import (
 @takes_scan
 def precompute(
     context: typer.Context,
-    sources: Annotated[list[Path], typer.Argument(metavar="RECIPE|SCAN...", help="recipes (.toml), or scans")],
+    sources: Annotated[list[Path], typer.Argument(metavar="SURFACE...", help="recipes (.toml), profiles, or scans")],
     output: Annotated[Path | None, typer.Option("-o", "--output", help="spectrum file; default: ./NAME.exr")] = None,
     representation: Annotated[str | None, typer.Option(help=f"{', '.join(REPRESENTATIONS)}; default: auto")] = None,
     tolerance: Annotated[
@@ -58,7 +55,8 @@ def precompute(
     largest_height_range: Annotated[float | None, typer.Option(help="refuse deeper surfaces, µm; default: 20")] = None,
     overwrite: Overwrite = False,
 ) -> None:
-    """Compute the power spectrum of the phase from recipes or scans."""
+    """Compute the power spectrum of the phase from recipes, profiles or scans."""
+    sources = [Path(source_named(str(source))) for source in sources]
     if output is not None and len(sources) > 1:
         raise RequestError(f"-o: got {len(sources)} sources, wanted one (without -o each is named after its source)")
     targets = [output or Path(source.name or "spectrum").with_suffix(".exr") for source in sources]
@@ -90,37 +88,19 @@ def _precompute(source: Path, recipe: Recipe, target: Path, seam: str) -> None:
             spectrum.save(target)
     tell(
         f"{target}: {spectrum.source}; {spectrum.extent}, {spectrum.grid}; coherence length "
-        f"{spectrum.coherence_length:.4g} µm; {_table_summary(spectrum)}{seam}"
+        f"{spectrum.coherence_length:.4g} µm; {spectrum.summary}{seam}"
     )
-    for text in (spectrum.excess, spectrum.warning) if isinstance(spectrum, GratingSpectrum) else ():
-        if text:
-            tell(f"! {text}")
-
-
-def _table_summary(spectrum: Spectrum) -> str:
-    size, tolerance = f"{spectrum.megabytes:.3g} MB", f"(tolerance {spectrum.tolerance:.3g})"
-    if isinstance(spectrum, RigorousSpectrum):
-        return (
-            f"rigorous, {spectrum.material_name}, {size}, mean error {spectrum.error:.1e} {tolerance}\n"
-            f"maximum error {spectrum.max_error:.1e} of the reflected light, {spectrum.max_error_near:.1e} near a "
-            "Rayleigh anomaly"
-            + ("" if spectrum.mueller is None else f"; Mueller matrices, mean {spectrum.polarisation_error:.1e}")
-        )
-    scatter = f", standard error of one scan {spectrum.standard_error:.2g}" if spectrum.extent == "sample" else ""
-    return (
-        f"{spectrum.representation}, {size}, error {spectrum.error:.1e} {tolerance}{scatter}\n"
-        f"truncated, at most: {spectrum.truncated_power:.1e} of the power at weak frequencies; "
-        f"{spectrum.unresolved_power:.1e} at frequencies that no direction reaches or no pixel resolves"
-    )
+    for concern in spectrum.concerns:
+        tell(f"! {concern}")
 
 
 def _seam(source: Path, recipe: Recipe) -> str:
-    """Return a line on the seam of a scan that is repeated as a tile; "" for a recipe.
+    """Return a line on the seam of a scan that is repeated as a tile; "" for another surface.
 
     Raises:
         ValueError: if the seam would be visible.
     """
-    if source.suffix.lower() == ".toml":
+    if "scan" not in recipe.surface or source.suffix.lower() == ".toml":
         return ""
     steps = seam_steps(recipe.height_field())
     seam = " and ".join(

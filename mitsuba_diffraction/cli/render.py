@@ -13,11 +13,11 @@ import typer
 
 from ..errors import RequestError
 from ..outputs import check_outputs, free_name
-from ..progress import durations, progress_bar, say, stage, tell
+from ..progress import bytes_text, durations, progress_bar, say, stage, tell
 from .arguments import Define, Overwrite, Variant, check_suffix, materials_of, scene_parameters
 
 if TYPE_CHECKING:
-    from ..color import View
+    from ..color import ViewTransform
     from ..render.passes import Estimate
     from ..render.spectral_image import SpectralImage
 
@@ -52,8 +52,8 @@ def render(
     material: Annotated[
         list[str] | None,
         typer.Option(
-            metavar="ID=RECIPE|PROFILE[,name=value…]",
-            help="replace the BSDF of this id by a grating; name=value: parameters of the grating",
+            metavar="ID=SURFACE[,name=value…]",
+            help="replace the BSDF of this id by a grating: a recipe, profile or spectrum; name=value: its parameters",
         ),
     ] = None,
     until_error: Annotated[
@@ -112,8 +112,8 @@ def render(
     from ..render.cluster import trace_on
     from ..render.passes import checkpoint_path, trace_locally
     from ..render.scene import files_of_scene, has_alpha, named_sample_count
+    from ..render.turntable import animations_of, save_animation
     from ..render.turntable import orbit as motions_of_orbit
-    from ..render.turntable import save_animation
 
     where: dict[str, Any] = {"parameters": scene_parameters(define), "materials": materials_of(material)}
     reads = files_of_scene(scene, **where)
@@ -160,9 +160,9 @@ def render(
                 complete=f"{number} of {len(pictures)} pictures are complete" if number else None,
             )
         if frames is not None:
-            animation = target.with_suffix(".webp")
-            save_animation([_preview(path) for path in pictures], animation)
-            tell(f"{animation}: animated preview, {frames} frames")
+            for animation in animations_of(target):
+                save_animation([_preview(path) for path in pictures], animation)
+                tell(f"{animation}: animated preview, {frames} frames")
 
 
 def _announce(
@@ -178,12 +178,12 @@ def _announce(
         return
     planes += estimate.channels if wavelengths is None else wavelengths
     size = bytes_per_number * planes * estimate.columns * estimate.rows
-    disk = f", {estimate.disk / 1e9:.2g} GB of disk meanwhile" if estimate.disk else ""
+    disk = f", {bytes_text(estimate.disk)} of disk meanwhile" if estimate.disk else ""
     say(
         label,
         f"{estimate.columns} × {estimate.rows} pixels, {estimate.spp} samples per pixel: about "
-        f"{estimate.seconds / 60:.0f} min, {estimate.memory / 1e9:.2g} GB of memory{disk}, a picture of "
-        f"{size / 1e6:.2g} MB before compression",
+        f"{estimate.seconds / 60:.0f} min, {bytes_text(estimate.memory)} of memory{disk}, a picture of "
+        f"{bytes_text(size)} before compression",
     )
     if named is not None and estimate.seconds > _HOUR:
         _log.warning(
@@ -241,8 +241,12 @@ def _pictures(target: Path, frames: int | None) -> list[Path]:
 def _outputs(target: Path, frames: int | None) -> list[Path]:
     """Return all files that the command writes."""
     pictures = _pictures(target, frames)
-    animation = [target.with_suffix(".webp")] if frames else []
-    return [*pictures, *(_preview(path) for path in pictures if _is_spectral(path)), *animation]
+    previews = [_preview(path) for path in pictures if _is_spectral(path)]
+    if frames is None:
+        return [*pictures, *previews]
+    from ..render.turntable import animations_of
+
+    return [*pictures, *previews, *animations_of(target)]
 
 
 def _picture(
@@ -254,7 +258,7 @@ def _picture(
     resume: bool,
     stored: dict[str, Any],
     denoise: bool,
-    view: View,
+    view: ViewTransform,
     label: str,
     exposure: float | None,
     complete: str | None,
@@ -324,10 +328,12 @@ def _picture(
             image.shape[2] if stored["channels"] is None else wider_hats(image.shape[2], stored["channels"]).shape[1]
         )
         channels = "RGB" if stored["rgb"] else f"{count} wavelengths"
-    exposed = f"exposed by {(stops := math.log2(exposure)):+.2f} stops (--exposure {stops:.2f})"
+    exposed = (
+        "denoised, " if denoise else ""
+    ) + f"exposed by {(stops := math.log2(exposure)):+.2f} stops (--exposure {stops:.2f})"
     tell(
         f"{path}: {_summary(image, request['until_error'], channels)}, "
-        f"{time.perf_counter() - start:.1f} s, {path.stat().st_size / 1e6:.3g} MB"
+        f"{time.perf_counter() - start:.1f} s, {bytes_text(path.stat().st_size)}"
         + (f"\n{preview}: preview, {exposed}" if _is_spectral(path) else f", {exposed}")
     )
     return exposure

@@ -12,10 +12,10 @@ import typer
 
 from ..files import whole_file
 from ..outputs import check_outputs
-from ..progress import NAME, progress_bar, say, tell
+from ..progress import NAME, bytes_text, progress_bar, say, tell
 from ..recipe import Recipe
 from ..viewer.page import page, reference_picture
-from ..viewer.surface import Surface
+from ..viewer.viewed_surface import Surface
 from .arguments import (
     SCAN_OPTIONS,
     Overwrite,
@@ -75,7 +75,7 @@ def view(
     with whole_file(target) as temporary:
         temporary.write_text(text, encoding="utf-8")
     shown = surfaces[0].spectrum.source if len(surfaces) == 1 else f"{len(surfaces)} surfaces"
-    tell(f"{target}: {shown}, {len(text.encode()) / 1e6:.2g} MB")
+    tell(f"{target}: {shown}, {bytes_text(len(text.encode()))}")
     address = target.resolve().as_uri()
     tell(f"open {address} in a browser")
     if open_page:

@@ -12,7 +12,7 @@ from PIL import Image
 from ..color import into_gamut, on_screen, plain_view
 from ..files import encoded_file, whole_file
 from ..outputs import MARK, METADATA
-from ..settings import VISIBLE, Settings
+from ..settings import VISIBLE, ScalarSettings
 from ..surface.heightfield import HeightField
 from .result import Design
 
@@ -42,7 +42,7 @@ def save(design: Design, path: str | os.PathLike[str]) -> tuple[Path, ...]:
     save_tiff(field, plate.height_range, paths[1])
     with whole_file(paths[2]) as temporary:
         temporary.write_text(_recipe(design, paths[0].name), encoding="utf-8")
-    save_picture(design, paths[3])
+    save_design_picture(design, paths[3])
     return paths
 
 
@@ -54,7 +54,7 @@ def _recipe(design: Design, scan: str) -> str:
         "coherence_length": f"{plate.coherence_length:.6g}",
         "tolerance": f"{_RECIPE_TOLERANCE}",
         **({} if plate.light == VISIBLE else {"wavelengths": f"[{plate.light[0]:.1f}, {plate.light[1]:.1f}]"}),
-        **({"largest_height_range": f"{deepest}"} if deepest > Settings().largest_height_range else {}),
+        **({"largest_height_range": f"{deepest}"} if deepest > ScalarSettings().largest_height_range else {}),
     }
     lines = [f"{name} = {value}" for name, value in settings.items()]
     head = f'# {MARK}: {design.height_field.source}\n[surface]\nscan = "{scan}"\n\n[spectrum]\n'
@@ -95,7 +95,7 @@ def simple_field(field: HeightField) -> bytes:
     return header + padding + (1e-6 * field.heights).astype("<f4").tobytes()
 
 
-def save_picture(design: Design, path: str | os.PathLike[str]) -> None:
+def save_design_picture(design: Design, path: str | os.PathLike[str]) -> None:
     """Write target, predicted picture, relief and efficiency over wavelength as one PNG."""
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure

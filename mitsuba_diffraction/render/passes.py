@@ -38,7 +38,7 @@ from numpy.typing import NDArray
 from ..color import spectrum_to_XYZ
 from ..errors import RequestError
 from ..files import discard, exclusive, whole_file
-from ..progress import stage
+from ..progress import bytes_text, stage
 from ..settings import VISIBLE
 from .film import (
     LightOfBands,
@@ -472,7 +472,8 @@ def render(
         tracer: traces the passes; default: this process, see also `cluster.trace_on`.
         progress: called at the start and after each pass with the samples per pixel done, in total (with `until_error`,
             extrapolated from the current error), and the current error (NaN before four passes).
-        announce: called once, after two passes (of the bands of a large picture: the first compiles).
+        announce: called after two passes (of the bands of a large picture: the first compiles), and again after a tenth
+            of them if the time differs by more than a quarter from what was announced.
         on_checkpoint: called after each checkpoint, while rendering goes on, with the picture so far. To bound memory,
             it is read from the sums block by block.
 
@@ -535,16 +536,22 @@ def _trace(
     on_checkpoint: Callable[[SpectralImage], object],
 ) -> bool:
     """Add passes to the sums until the picture is complete or Ctrl-C was pressed; return whether it is complete."""
-    first, total, started = sums.done, len(job.samples) * len(job.bands), 0.0
+    first, work = sums.done, [samples for samples in job.samples for _ in job.bands]
+    # Bands differ: the second estimate is made after a tenth of the work, and after all bands.
+    estimates = {first + 2, first + max(2, 1 + len(job.bands), math.ceil((len(work) - first) / 10))}
+    spent, before, expected = 0.0, 0.0, 0.0
     complete = _is_complete(sums, job, progress)
     last_checkpoint, interval = time.monotonic(), seconds
     with _deferred_interrupt() as interrupted, closing(tracer(job, scene, sums.done)) as traced:
         while not (complete or interrupted()):
             with stage("kernels and first pass" if sums.done == first else "rendering"):
                 sums.add(next(traced), job.samples[sums.done // len(job.bands)])
-            if sums.done == first + 2:
-                announce((time.perf_counter() - started) * (total - sums.done))
-            started = time.perf_counter()
+            before, spent = (now := time.perf_counter()), spent + (now - before if sums.done > first + 1 else 0)
+            if sums.done in estimates:
+                remaining = spent / sum(work[first + 1 : sums.done]) * sum(work[sums.done :])
+                if not 0.8 <= (spent + remaining) / (expected or math.inf) <= 1.25:
+                    expected = spent + remaining
+                    announce(remaining)
             complete = _is_complete(sums, job, progress)
             due = interrupted() or time.monotonic() - last_checkpoint >= interval
             if checkpoint is not None and due and not complete:
@@ -607,8 +614,8 @@ def _check_disk(job: Job, columns: int, checkpoint: str | os.PathLike[str] | Non
     available = shutil.disk_usage(folder).free + sum(path.stat().st_size for path in paths if path.is_file())
     if needed > available:
         raise RequestError(
-            f"{folder}: got {columns} × {bands[-1][1]} pixels, whose checkpoints take {needed / 1e9:.3g} GB of the "
-            f"disk, wanted at most the {available / 1e9:.3g} GB that are free"
+            f"{folder}: got {columns} × {bands[-1][1]} pixels, whose checkpoints take {bytes_text(needed)} of the "
+            f"disk, wanted at most the {bytes_text(available)} that are free"
         )
     return needed
 

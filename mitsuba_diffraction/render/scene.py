@@ -6,10 +6,13 @@ import hashlib
 import logging
 import os
 import re
+import shutil
+import subprocess
+import sys
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
-from difflib import get_close_matches
 from pathlib import Path
+from tempfile import TemporaryDirectory
 from typing import Any
 
 import drjit as dr
@@ -20,12 +23,12 @@ from numpy.typing import NDArray
 
 from ..bsdf.base import gratings_in, is_grating
 from ..bsdf.diffraction_grating import check
-from ..bsdf.light import cover_light, wavelengths_of
-from ..errors import RequestError, root_cause
-from ..files import refuse_other_than_utf8
+from ..bsdf.light import cover_light, recorded_wavelengths
+from ..errors import RequestError, did_you_mean, root_cause
+from ..files import examples_folder, refuse_other_than_utf8, whole_file
 from ..llvm import is_supported
-from ..precomputation import is_rigorous
-from ..recipe import Recipe
+from ..progress import progress_bar
+from ..recipe import Recipe, source_named, theory_in
 from ..settings import VISIBLE
 
 _log = logging.getLogger(__name__)
@@ -78,7 +81,7 @@ def channel_weights(spectral_range: SpectralRange = VISIBLE) -> NDArray[np.float
 
 def recorded_range(scene: mi.Scene) -> SpectralRange:
     """Return the range of the first sensor of a scene from `load_spectral_scene`."""
-    shortest, longest = wavelengths_of(scene.sensors()[0].film())
+    shortest, longest = recorded_wavelengths(scene.sensors()[0].film())
     return round(shortest, 6), round(longest, 6)
 
 
@@ -248,7 +251,7 @@ def _draw_wavelengths_of_lights(scene: mi.Scene) -> None:
         distribution = mi.traverse(sensor.film().sensor_response_function())
         response = np.array(distribution["values"], np.float64)
         response /= response.sum()
-        grid = np.linspace(*wavelengths_of(sensor.film()), response.size)
+        grid = np.linspace(*recorded_wavelengths(sensor.film()), response.size)
         lines = np.zeros_like(response)
         for emitter in scene.emitters():
             recorded = response * _emission(emitter, grid)
@@ -396,9 +399,7 @@ def _has_base(values: Mapping[str, bool | float | str]) -> bool:
     if {"material", "base"} & values.keys() or values.get("transmission", "none") != "none":
         return False
     path = _resolved(values.get("filename", ""))
-    if path.suffix.lower() == ".toml" and path.is_file():
-        return Recipe.load(path).settings.theory == "scalar"
-    return values.get("theory") != "rigorous" and not is_rigorous(path)
+    return "rigorous" not in (values.get("theory"), theory_in(path) if path.is_file() else "scalar")
 
 
 def _transmits(props: mi.Properties) -> bool:
@@ -471,19 +472,47 @@ def files_of_scene(
 
 
 def _refuse_missing_files(path: Path, state: mi.parser.ParserState) -> None:
-    """Raise RequestError if a mesh or texture is missing, before spectra are computed for the scene.
+    """Raise RequestError if a mesh, texture or named surface is missing, before spectra are computed for the scene.
 
-    The message quotes the command that a comment of the scene gives for them: "… made by: python scenes/disc.py".
+    Models of the package's scenes are made here, if a comment says how: "… made by: python scenes/disc.py". In other
+    cases the message quotes that command.
     """
     for node in state.nodes:
         name = node.props.get("filename")
-        # The error of the grating lists the available spectra.
-        if not isinstance(name, str) or node.props.plugin_name() == "diffraction_grating":
+        if not isinstance(name, str):
             continue
+        if node.props.plugin_name() == "diffraction_grating":
+            source_named(str(_resolved(name)))  # if it is a file, the error of the grating lists the available spectra
+            continue
+        if _resolved(name).is_file():
+            continue
+        text = path.read_text(encoding="utf-8", errors="replace")
+        made = re.search(r"made by:\s+(python \S+\.py(?: && python \S+\.py)*)", text)
+        if made and Path(name).parent == Path("models"):
+            _make_models(re.findall(r"scenes/(\w+)\.py", made[1]), path.resolve().parent / "models")
         if not _resolved(name).is_file():
-            text = path.read_text(encoding="utf-8", errors="replace")
-            made = re.search(r"made by:\s+(python \S+\.py(?: && python \S+\.py)*)", text)
             raise RequestError(f"{name}: no such file" + (f"; it is made by: {made[1]}" if made else ""))
+
+
+def _make_models(scripts: list[str], folder: Path) -> None:
+    """Make what is missing of the models of a scene, by the scripts of the package, not by those beside the scene.
+
+    In another process, as they need another variant. Files that exist are kept.
+    """
+    scenes = examples_folder() / "scenes"
+    scripts = [script for script in scripts if (scenes / f"{script}.py").is_file()]
+    for script in scripts:
+        with progress_bar(f"models by {script}.py", "", "made once"), TemporaryDirectory() as made:
+            program = f"import sys, pathlib; sys.path.insert(0, sys.argv[1]); import {script}\n"
+            program += f"{script}.make(pathlib.Path(sys.argv[2]))"
+            done = subprocess.run([sys.executable, "-c", program, str(scenes), made], capture_output=True, text=True)
+            if done.returncode:
+                raise RuntimeError(f"models: {script}.py failed ({' '.join(done.stderr.split()[-30:])})")
+            folder.mkdir(exist_ok=True)
+            for file in Path(made).iterdir():
+                if not (folder / file.name).exists():
+                    with whole_file(folder / file.name) as temporary:
+                        shutil.copyfile(file, temporary)
 
 
 def _unwrap_integrators(state: mi.parser.ParserState) -> None:
@@ -643,8 +672,7 @@ def _alternatives(scene: Path, error: str) -> str:
     if (missing := re.search(r"undefined parameter: \$(\w+)", error)) is not None:
         return f"; set it by -D {missing[1]}=…"
     if (missing := re.search(r'Plugin "(\w+)" not found', error)) is not None:
-        similar = get_close_matches(missing[1], _PLUGINS, n=1)
-        return f"; did you mean {similar[0]}?" if similar else ""
+        return did_you_mean(missing[1], _PLUGINS)
     if "unused parameters" in error:
         text = scene.read_text(encoding="utf-8", errors="replace")
         known = sorted({*re.findall(r"\$(\w+)", text), *re.findall(r'<default\s+name="(\w+)"', text)})

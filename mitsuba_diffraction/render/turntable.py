@@ -2,18 +2,26 @@
 
 from __future__ import annotations
 
+import importlib.util
 import os
+import subprocess
 from collections.abc import Iterable, Mapping
+from contextlib import suppress
 from pathlib import Path
+from tempfile import TemporaryFile
+from typing import TYPE_CHECKING
 
 import mitsuba as mi
 import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from ..files import encoded_file
+from ..files import encoded_file, whole_file
 from ..outputs import MARK
 from .scene import Materials, load_spectral_scene
+
+if TYPE_CHECKING:
+    from PIL import Image
 
 _FRAMES_PER_SECOND = 12
 
@@ -52,18 +60,39 @@ def _view(scene: mi.Scene) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     return origin + forward * (forward @ (centre - origin)), up
 
 
-def save_animation(previews: Iterable[Path], path: str | os.PathLike[str]) -> None:
-    """Join pictures of equal size into a looping animated WebP at twelve frames per second."""
+def animations_of(path: Path) -> list[Path]:
+    """Return the animations of an orbit: a WebP, a GIF and, with the package imageio-ffmpeg, an MP4."""
+    films = [".mp4"] if importlib.util.find_spec("imageio_ffmpeg") else []
+    return [path.with_suffix(suffix) for suffix in (".webp", ".gif", *films)]
+
+
+def save_animation(previews: Iterable[Path], path: Path) -> None:
+    """Join pictures of equal size at twelve frames per second: a looping .webp or .gif, or an .mp4 (H.264)."""
     from PIL import Image
 
     first, *others = (Image.open(preview).convert("RGB") for preview in previews)
+    if path.suffix == ".mp4":
+        _save_film([first, *others], path)
+        return
+    marked = {"xmp": MARK.encode(), "quality": 85} if path.suffix == ".webp" else {"comment": MARK.encode()}
     with encoded_file(path) as stream:
-        first.save(
-            stream,
-            save_all=True,
-            append_images=others,
-            duration=1000 // _FRAMES_PER_SECOND,
-            loop=0,
-            quality=85,
-            xmp=MARK.encode(),
-        )
+        first.save(stream, save_all=True, append_images=others, duration=1000 // _FRAMES_PER_SECOND, loop=0, **marked)
+
+
+def _save_film(frames: list[Image.Image], path: Path) -> None:
+    """Write an .mp4; an odd row or column is cut off, as H.264 has half as many colours."""
+    from imageio_ffmpeg import get_ffmpeg_exe
+
+    width, height = (length // 2 * 2 for length in frames[0].size)
+    source = f"-f rawvideo -pix_fmt rgb24 -s {width}x{height} -r {_FRAMES_PER_SECOND} -i -".split()
+    film = ["-c:v", "libx264", "-crf", "18", "-pix_fmt", "yuv420p", "-metadata", f"comment={MARK}", "-y"]
+    with whole_file(path) as temporary, TemporaryFile() as errors:
+        call = [get_ffmpeg_exe(), "-loglevel", "error", *source, *film, str(temporary)]
+        with subprocess.Popen(call, stdin=subprocess.PIPE, stderr=errors) as process:
+            assert process.stdin is not None
+            with suppress(BrokenPipeError), process.stdin as stream:
+                for frame in frames:
+                    stream.write(frame.crop((0, 0, width, height)).tobytes())
+        if process.returncode:
+            errors.seek(0)
+            raise OSError(f"{path}: cannot be written ({' '.join(errors.read().decode(errors='replace').split())})")

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from ..errors import RequestError
 from ..progress import Progress, part, stage
-from ..settings import CONTINUUM_TOLERANCE, ORDERS_TOLERANCE, SERIES, Settings, lobe_width
+from ..settings import CONTINUUM_TOLERANCE, ORDERS_TOLERANCE, SERIES, ScalarSettings, lobe_width
 from ..surface.heightfield import HeightField
 from .grids import LobeAxis, OrderGrid, inner
 from .power_spectrum import PowerSpectrum
@@ -47,7 +47,7 @@ _MAX_TABLE_BYTES = 4e9
 Splines = SamplePowers | TileSplines
 
 
-def build_spectrum(patches: Sequence[HeightField], settings: Settings, progress: Progress) -> PowerSpectrum:
+def build_power_spectrum(patches: Sequence[HeightField], settings: ScalarSettings, progress: Progress) -> PowerSpectrum:
     """Compute the mean power spectrum of the phase e^{iκh} of patches of one size; raises and warns as `precompute`."""
     height_field = patches[0]
     height_range = max(patch.height_range for patch in patches)
@@ -97,13 +97,13 @@ def build_spectrum(patches: Sequence[HeightField], settings: Settings, progress:
         table=table,
         grid=build.kept,
         # Settings that do not affect the table are left at their defaults, as in files.
-        settings=Settings(
-            settings.extent,
-            effective,
-            settings.wavelengths,
-            float(settings.largest_angle),
-            table.representation,
-            float(tolerance),
+        settings=ScalarSettings(
+            extent=settings.extent,
+            coherence_length=effective,
+            wavelengths=settings.wavelengths,
+            largest_angle=float(settings.largest_angle),
+            representation=table.representation,
+            tolerance=float(tolerance),
             terms=len(table.terms) if isinstance(table, AmplitudeTable) else None,
             heights_from=settings.heights_from,
         ),
@@ -121,7 +121,7 @@ def build_spectrum(patches: Sequence[HeightField], settings: Settings, progress:
 
 def _default_tolerance(height_field: HeightField, patches: int, sigma: float) -> float:
     """Return the default tolerance of a tile, from whether its orders, of width σ_q, overlap."""
-    half_width = Settings(tolerance=CONTINUUM_TOLERANCE).lobe_cutoff * sigma
+    half_width = ScalarSettings(tolerance=CONTINUUM_TOLERANCE).lobe_cutoff * sigma
     overlap = any(
         count > 1 and 1 / size < 2 * half_width
         for size, count in zip(height_field.tile_size, height_field.shape[::-1], strict=True)
@@ -267,7 +267,7 @@ class _Build:
                 intervals, storage.terms, self._max_kappa, powers, self._phase(0.0, 0.7), storage.rounded, kept
             )
 
-    def series(self, heights: NDArray[np.float64], settings: Settings) -> tuple[AmplitudeTable, float]:
+    def series(self, heights: NDArray[np.float64], settings: ScalarSettings) -> tuple[AmplitudeTable, float]:
         """Return the amplitude series of a tile, with the requested or required number of terms, and its error."""
         kind, origin = settings.representation, settings.heights_from
         heights = heights - (heights.min() if origin == "lowest" else heights.mean())

@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from ..errors import RequestError, check_whole
-from ..settings import Settings, lobe_width, matching
+from ..settings import ScalarSettings, lobe_width, matching
 from .grids import LobeAxis, OrderGrid, SplineGrid
 from .tables import AmplitudeTable, SliceTable
 
@@ -41,7 +41,7 @@ class PowerSpectrum:
 
     table: SliceTable | AmplitudeTable
     grid: OrderGrid | SplineGrid
-    settings: Settings
+    settings: ScalarSettings
     pixel_size: tuple[float, float]
     height_range: float
     error: float

@@ -14,65 +14,26 @@ Raises:
 
 from __future__ import annotations
 
+import warnings
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.special import erf
 
-from ..errors import RequestError, check_whole, is_number
-from .heightfield import HeightField, as_pixel_size
-
-MAX_PIXELS = 2**26
-"""Of a profile: half a gigabyte of heights."""
-
-MAX_PERIOD = 100.0
-"""µm: orders of visible light are 0.3° apart, about the width of the sun. A period given in nm is larger."""
-
-Array = NDArray[np.float64]
-
-
-def check_pixels(columns: float, rows: float) -> None:
-    """Refuse too large a patch before its memory is allocated."""
-    if not columns * rows <= MAX_PIXELS:
-        raise RequestError(f"got a patch of {columns:.4g} × {rows:.4g} pixels, wanted at most {MAX_PIXELS} in all")
-
-
-def check_positive(name: str, value: float, unit: str = "in µm") -> None:
-    if not (is_number(value) and value > 0):
-        raise RequestError(f"{name}: got {value!r}, wanted a positive number {unit}")
-
-
-def check_period(name: str, value: float) -> None:
-    check_positive(name, value)
-    if value > MAX_PERIOD:
-        raise RequestError(
-            f"{name}: got {value!r} µm, wanted at most {MAX_PERIOD:g}; is it in nm ({value / 1e3:g} µm)? A grating "
-            "that is really that coarse may be given as an array of heights"
-        )
-
-
-def check_profile(period: float, depth: float, samples: int = 2) -> None:
-    check_period("period", period)
-    if not (is_number(depth) and depth >= 0):
-        raise RequestError(f"depth: got {depth!r}, wanted a number in µm, zero or more")
-    check_whole("samples", samples, 2)
-    check_pixels(samples, 1)
-
-
-def generator(seed: int) -> np.random.Generator:
-    check_whole("seed", seed, 0)
-    return np.random.default_rng(int(seed))
-
-
-def phase(samples: int) -> Array:
-    """Return x / period at the centres of the pixels, (samples,)."""
-    return (np.arange(samples) + 0.5) / samples
-
-
-def one_row(heights: Array, period: float, source: str) -> HeightField:
-    return HeightField(heights[None, :], (period / len(heights), period), source)
+from ..errors import RequestError, check_whole, did_you_mean, is_number
+from .drawing import (
+    Canvas,
+    check_period,
+    check_pixels,
+    check_positive,
+    check_profile,
+    generator,
+    one_row,
+    phase,
+    smooth_step,
+)
+from .heightfield import HeightField
+from .skins import elaphe_synthetic, xenopeltis_synthetic
 
 
 def blazed(period: float = 2.5, depth: float = 0.246, *, samples: int = 512) -> HeightField:
@@ -417,348 +378,6 @@ def morpho_ridges(
     )
 
 
-class Canvas:
-    """A periodic patch for drawing small shapes, which wrap around at its edges.
-
-    Attributes:
-        size: (x, y) µm, along the diffracting axis rounded to a whole number of pitches.
-        count: numbers of pitches along x and y.
-        pitch: (x, y) µm, mean spacings, which divide the size.
-        heights: (N_y, N_x) µm.
-    """
-
-    def __init__(
-        self, size: float | tuple[float, float], pixel_size: float, pitch: tuple[float, float], axis: int
-    ) -> None:
-        try:
-            self.size = as_pixel_size(size)
-        except RequestError:
-            raise RequestError(f"size: got {size!r}, wanted a positive number or (x, y) in µm") from None
-        check_positive("pixel_size", pixel_size)
-        if self.size[0] < 2 * pitch[0] or self.size[1] < 4 * pitch[1]:
-            raise RequestError(
-                f"size: got {size!r} µm, wanted at least 2 × 4 mean spacings, {2 * pitch[0]:.4g} × {4 * pitch[1]:.4g} "
-                "µm"
-            )
-        if pixel_size > min(pitch) / 4:
-            raise RequestError(f"pixel_size: got {pixel_size!r} µm, wanted at most {min(pitch) / 4:.4g} µm")
-        check_pixels(*(s / pixel_size for s in self.size))
-        columns, rows = (round(s / pixel_size) for s in self.size)
-        self.count = tuple(round(s / p) for s, p in zip(self.size, pitch, strict=True))
-        # The period is preserved: along its axis the size is adjusted, not the pitch.
-        x, y = (pitch[i] * self.count[i] if i == axis else self.size[i] for i in (0, 1))
-        self.size = (x, y)
-        self.pitch = tuple(s / n for s, n in zip(self.size, self.count, strict=True))
-        self.pixel = (self.size[0] / columns, self.size[1] / rows)
-        self.heights = np.zeros((rows, columns))
-
-    def centres(self, axis: int) -> Array:
-        """Return the centres of the pitches along x (0) or y (1), µm."""
-        return (np.arange(self.count[axis], dtype=np.float64) + 0.5) * self.pitch[axis]
-
-    def window(
-        self, x: tuple[float, float], y: tuple[float, float]
-    ) -> tuple[tuple[NDArray[np.signedinteger], ...], Array, Array]:
-        """Return the pixels of the box x[0]…x[1], y[0]…y[1] µm.
-
-        Returns:
-            index: of the pixels in `heights`, wrapped.
-            X, Y: centres of the pixels, (1, n_x) and (n_y, 1), µm, not wrapped.
-        """
-        columns, rows = (
-            np.arange(int(np.floor(a / p)), min(int(np.ceil(b / p)), int(np.floor(a / p)) + n))
-            for (a, b), p, n in zip((x, y), self.pixel, self.heights.shape[::-1], strict=True)
-        )
-        index = np.ix_(rows % self.heights.shape[0], columns % self.heights.shape[1])
-        x_index, y_index = columns[None, :].astype(np.float64), rows[:, None].astype(np.float64)
-        return index, (x_index + 0.5) * self.pixel[0], (y_index + 0.5) * self.pixel[1]
-
-    def noise(self, rng: np.random.Generator, length_x: float, length_y: float) -> Array:
-        """Draw periodic Gaussian noise, mean 0, variance 1, correlation exp(−x²/4 length_x² − …), (N_y, N_x)."""
-        rows, columns = self.heights.shape
-        q_x = np.fft.rfftfreq(columns, self.pixel[0])
-        q_y = np.fft.fftfreq(rows, self.pixel[1])[:, None]
-        filter_ = np.exp(-2 * np.pi**2 * ((q_x * length_x) ** 2 + (q_y * length_y) ** 2))
-        filter_[0, 0] = 0
-        field = np.fft.irfft2(np.fft.rfft2(rng.standard_normal((rows, columns))) * filter_, s=(rows, columns))
-        return field / field.std()
-
-    def at(self, field: Array, x: float, y: float) -> float:
-        """Return the value of a field at a position, µm, wrapped."""
-        rows, columns = field.shape
-        return field[int(y / self.pixel[1]) % rows, int(x / self.pixel[0]) % columns]
-
-    def height_field(self, rng: np.random.Generator, depth: float, source: str) -> HeightField:
-        """Return the drawing, scaled to `depth` and shifted by a random offset, as seeds must not share a lattice."""
-        heights = np.roll(self.heights - self.heights.min(), rng.integers(self.heights.shape), axis=(0, 1))
-        return HeightField(heights / heights.max() * depth, self.pixel, source)
-
-
-def smooth_step(x: Array, width: float) -> Array:
-    """Return a smooth step from 0 to 1 at x = 0."""
-    return (1 + erf(x / width)) / 2
-
-
-def elaphe(
-    size: float | tuple[float, float] = 32.0,
-    *,
-    pixel_size: float = 0.0625,
-    depth: float = 0.375,
-    period: float = 1.144,
-    seed: int = 0,
-) -> HeightField:
-    """Draw a synthetic replica of the shed skin of *Elaphe guttata*, not a measurement.
-
-    Fingers along x that taper towards +x, side by side along **y**, the diffracting direction. Between two fingers a
-    groove starts as a deep narrow crotch and widens up to the tips of the fingers, where the next row begins, 2.93
-    periods further on. Granules sit on top of the fingers. Positions, lengths, widths, heights and tilts vary from
-    finger to finger as in AFM scans of such skins. The shape is modelled on a 5.9 µm AFM scan of the LANE lab, Geneva.
-
-    `period` is the mean distance from finger to finger. size_y is rounded to whole periods, and the pitch of the rows
-    is adjusted to size_x; the patch holds at least two rows and four fingers.
-    """
-    check_profile(period, depth)
-    rng = generator(seed)
-    canvas = Canvas(size, pixel_size, pitch=(2.93 * period, period), axis=1)
-    row_pitch, pitch = canvas.pitch
-
-    # The lattice of crotches: it drifts slowly, rows shift against each other, and every crotch is displaced.
-    drift_x = 0.08 * row_pitch * canvas.noise(rng, 8.0, 4.0)
-    drift_y = 0.12 * pitch * canvas.noise(rng, 8.0, 8.0)
-    granules = np.zeros_like(canvas.heights)
-    for x, row_shift in zip(canvas.centres(0), rng.normal(0, 0.05 * pitch, canvas.count[0]), strict=True):
-        for y in canvas.centres(1):
-            x_0 = x + canvas.at(drift_x, x, y) + rng.normal(0, 0.04 * row_pitch)
-            y_0 = y + canvas.at(drift_y, x, y) + row_shift + rng.normal(0, 0.035 * pitch)
-            _elaphe_groove(canvas, rng, x_0, y_0)
-            _elaphe_tip(canvas, rng, x_0, y_0 + pitch / 2)
-            _elaphe_granules(canvas, granules, rng, x_0, y_0 + pitch / 2)
-    # Fibrils run along the fingers; the rest is roughness.
-    canvas.heights += granules
-    canvas.heights += 0.005 * canvas.noise(rng, 0.3, 0.04) + 0.008 * canvas.noise(rng, 1.5, 0.7)
-    return canvas.height_field(
-        rng,
-        depth,
-        f"synthetic Elaphe skin, {canvas.count[1]} fingers of {pitch:.4g} µm along y, "
-        f"{canvas.count[0]} rows of {row_pitch:.4g} µm along x, depth {depth:g} µm, seed {seed}",
-    )
-
-
-# Heights in µm as they were read off the mean unit cell of the AFM patch; the patch is scaled to `depth` at the end.
-
-
-def _elaphe_groove(canvas: Canvas, rng: np.random.Generator, x_0: float, y_0: float) -> None:
-    """Draw the groove between two fingers, from its crotch at (x_0, y_0) along +x."""
-    row_pitch, pitch = canvas.pitch
-    length = row_pitch * (0.97 + rng.normal(0, 0.035))
-    tilt = (-0.1 + rng.normal(0, 0.05)) * pitch / row_pitch
-    width = 0.38 + rng.normal(0, 0.035)
-    floor = 0.09 * rng.uniform(0.8, 1.2)
-    crotch = 0.03 + 0.09 * rng.beta(1, 3)
-    index, x, y = canvas.window((x_0 - 0.15 * row_pitch, x_0 + 1.3 * row_pitch), (y_0 - 0.8 * pitch, y_0 + 0.8 * pitch))
-    s = (x - x_0) / length
-    t = (y - y_0 - tilt * (x - x_0)) / pitch
-    half = width * np.clip(s, 0, 1) ** 0.7
-    groove = (
-        smooth_step(half - np.abs(t), 0.105)
-        * smooth_step(s, 0.05)
-        * (1 - smooth_step(s - 1.09 + 0.15 * np.abs(t), 0.13))
-    )
-    dip = np.exp(-(((s - 0.1) / 0.1) ** 2) - ((t / (0.085 + 0.03 * np.clip(s / 0.2, 0, 1))) ** 2))
-    canvas.heights[index] -= floor * groove + crotch * dip
-
-
-def _elaphe_tip(canvas: Canvas, rng: np.random.Generator, x_0: float, y_0: float) -> None:
-    """Draw the round edge where a finger ends on the next row, which lies lower there and rises again."""
-    row_pitch, pitch = canvas.pitch
-    x_tip = x_0 + row_pitch * (0.93 + rng.normal(0, 0.05))
-    y_tip = y_0 - 0.1 * pitch
-    drop = 0.028 * rng.uniform(0.4, 1.6)
-    index, x, y = canvas.window((x_tip - 0.3 * row_pitch, x_tip + 0.8 * row_pitch), (y_tip - pitch, y_tip + pitch))
-    t = (y - y_tip) / pitch
-    s = (x - x_tip) / row_pitch + 0.5 * t**2
-    canvas.heights[index] -= drop * smooth_step(s, 0.02) * np.exp(-np.maximum(s, 0) / 0.12) * np.exp(-((t / 0.42) ** 4))
-
-
-def _elaphe_granules(canvas: Canvas, granules: Array, rng: np.random.Generator, x_0: float, y_0: float) -> None:
-    """Draw a few large granules and some small ones along the ridge of a finger; overlaps keep the higher one."""
-    row_pitch, pitch = canvas.pitch
-    for number, radius, height in ((rng.poisson(2.6), 0.12, 0.09), (rng.poisson(5.0), 0.055, 0.03)):
-        for _ in range(number):
-            size = rng.uniform(0.7, 1.35)
-            along = rng.uniform(0.0, 0.9)
-            x_g = x_0 + along * row_pitch
-            y_g = y_0 - 0.1 * along * pitch + rng.normal(0, 0.08) * pitch
-            r = radius * size
-            index, x, y = canvas.window((x_g - 3.5 * r, x_g + 4.5 * r), (y_g - 3 * r, y_g + 3 * r))
-            # Granules lean along the finger, as the scan shows them.
-            stretch = np.where(x > x_g, 1.4, 1.0)
-            granule = height * size * np.exp(-(((x - x_g) / (stretch * r)) ** 2) - ((y - y_g) / r) ** 2)
-            granules[index] = np.maximum(granules[index], granule)
-
-
-def xenopeltis(
-    size: float | tuple[float, float] = 32.0,
-    *,
-    pixel_size: float = 0.0625,
-    depth: float = 0.443,
-    period: float = 1.552,
-    seed: int = 0,
-) -> HeightField:
-    """Draw a synthetic replica of the shed skin of *Xenopeltis unicolor*, not a measurement.
-
-    Rows of short round fingers, which point along +x and rise towards their tips like roof tiles. Rows run along y, one
-    period apart along **x**, the diffracting direction. They meander by 10 to 20 degrees and occasionally fork or end.
-    Fingers are 0.36 periods apart along y, with small deep pits between them; some are joined. The shape is modelled on
-    a 5.9 µm AFM scan of the LANE lab, Geneva.
-
-    `period` is the mean distance from row to row. size_x is rounded to whole periods, and the pitch of the fingers is
-    adjusted to size_y; the patch holds at least two rows and four fingers.
-    """
-    check_profile(period, depth)
-    rng = generator(seed)
-    canvas = Canvas(size, pixel_size, pitch=(period, 0.36 * period), axis=0)
-    row_pitch, pitch = canvas.pitch
-
-    meander = 0.11 * row_pitch * canvas.noise(rng, 6.0, 1.3)
-    faults = _faults(canvas, rng)
-    rows = [(x, None) for x in canvas.centres(0)] + [(fault.x, fault) for fault in faults if fault.extra]
-    fingers = []
-    for x, own in rows:
-        # Every row has a phase of its own, and a finger more or less than its neighbours where there are many.
-        count = canvas.count[1] + round(rng.normal(0, 0.012 * canvas.count[1]))
-        row_phase = rng.uniform()
-        for index in range(count):
-            y = (index + row_phase + rng.normal(0, 0.09)) * canvas.size[1] / count
-            if not _present(faults, own, x, y, canvas):
-                continue
-            x_0 = x + _fault_shift(faults, x, y, canvas)
-            x_0 += canvas.at(meander, x_0, y)
-            fingers.append((x_0, y, row_pitch * (1 + rng.normal(0, 0.05))))
-    for x_0, y_0, length in fingers:
-        _xenopeltis_finger(canvas, rng, x_0, y_0, length)
-    for x_0, y_0, length in fingers:
-        _xenopeltis_pit(canvas, rng, x_0, y_0 + pitch / 2, length)
-    canvas.heights += 0.005 * canvas.noise(rng, 0.07, 0.04) + 0.006 * canvas.noise(rng, 1.0, 1.0)
-    return canvas.height_field(
-        rng,
-        depth,
-        f"synthetic Xenopeltis skin, {canvas.count[0]} rows of {row_pitch:.4g} µm along x, "
-        f"fingers of {pitch:.3g} µm along y, depth {depth:g} µm, seed {seed}",
-    )
-
-
-@dataclass(frozen=True)
-class _Fault:
-    """A stretch along y where there is a row more or a row less: rows fork or join at its ends.
-
-    Attributes:
-        x, y: centre, µm.
-        half: half the length along y, µm.
-        extra: True for a row more, False for a row less.
-    """
-
-    x: float
-    y: float
-    half: float
-    extra: bool
-
-    def weight(self, y: float, size_y: float) -> float:
-        """Return 1 inside the fault, 0 outside, smooth at its ends."""
-        d = _wrapped(y - self.y, size_y)
-        return float((erf((d + self.half) / 1.2) - erf((d - self.half) / 1.2)) / 2)
-
-
-def _wrapped(distance: float, size: float) -> float:
-    """Return the shortest distance on a circle of circumference `size`."""
-    return (distance + size / 2) % size - size / 2
-
-
-def _faults(canvas: Canvas, rng: np.random.Generator) -> list[_Fault]:
-    """Draw separate faults, about one per 200 µm²; equally many add and remove a row, which keeps the mean pitch."""
-    row_pitch = canvas.pitch[0]
-    faults: list[_Fault] = []
-    wanted = 2 * round(canvas.size[0] * canvas.size[1] / 400)
-    for _ in range(20 * wanted):
-        if len(faults) == wanted:
-            break
-        extra = len(faults) % 2 == 0
-        # An added row lies between two rows, a missing row at the position of one.
-        x = (rng.integers(canvas.count[0]) + (1.0 if extra else 0.5)) * row_pitch % canvas.size[0]
-        fault = _Fault(x, rng.uniform(0, canvas.size[1]), rng.uniform(1.5, 3.0), extra)
-        if all(
-            abs(_wrapped(x - other.x, canvas.size[0])) > 3.2 * row_pitch
-            or abs(_wrapped(fault.y - other.y, canvas.size[1])) > fault.half + other.half + 2.5
-            for other in faults
-        ):
-            faults.append(fault)
-    return faults[: len(faults) // 2 * 2]
-
-
-def _present(faults: list[_Fault], own: _Fault | None, x: float, y: float, canvas: Canvas) -> bool:
-    """Return whether the row at x has a finger at y; `own` is the fault that made the row, if one did."""
-    if own is not None:
-        return own.weight(y, canvas.size[1]) > 0.5
-    return all(
-        fault.extra
-        or abs(_wrapped(x - fault.x, canvas.size[0])) > canvas.pitch[0] / 4
-        or fault.weight(y, canvas.size[1]) < 0.5
-        for fault in faults
-    )
-
-
-def _fault_shift(faults: list[_Fault], x: float, y: float, canvas: Canvas) -> float:
-    """Return the shift of the row at x by the faults, µm: away from an added row, towards a missing one."""
-    row_pitch = canvas.pitch[0]
-    shift = 0.0
-    for fault in faults:
-        d = _wrapped(x - fault.x, canvas.size[0])
-        nearest, sign = (row_pitch / 2, 1.0) if fault.extra else (row_pitch, -1.0)
-        decay = np.exp(-max(abs(d) - nearest, 0.0) / (3 * row_pitch))
-        shift += sign * np.sign(d) * row_pitch / 2 * decay * fault.weight(y, canvas.size[1])
-    return float(shift)
-
-
-def _xenopeltis_finger(canvas: Canvas, rng: np.random.Generator, x_0: float, y_0: float, length: float) -> None:
-    """Draw a finger that rises from its root at x_0 to a round tip; where shapes overlap, the higher one stays."""
-    pitch = canvas.pitch[1]
-    # Some are swollen and join their neighbour.
-    swollen = rng.uniform() < 0.1
-    top = rng.uniform(0.08, 0.12) if swollen else rng.uniform(0.05, 0.11)
-    width = 0.75 if swollen else 0.5 + rng.normal(0, 0.05)
-    tilt = rng.normal(0.03, 0.06) * pitch / length
-    index, x, y = canvas.window((x_0 - 0.1 * length, x_0 + 1.2 * length), (y_0 - 1.4 * pitch, y_0 + 1.4 * pitch))
-    s = (x - x_0) / length
-    t = (y - y_0 - tilt * (x - x_0)) / pitch
-    cap = np.sqrt(np.clip(1 - np.clip((s - 0.75) / 0.25, 0, None) ** 2, 0, 1))
-    taper = 0.1 if swollen else 0.4
-    half = width * (1 - taper * np.clip(s, 0, 1)) * cap
-    finger = top * np.clip(s, 0, 1) ** 1.2 * smooth_step(half - np.abs(t), 0.17) * (1 - smooth_step(s - 1, 0.035))
-    canvas.heights[index] = np.maximum(canvas.heights[index], finger)
-    # Debris sticks to a few tips, as the scan shows.
-    if rng.uniform() < 0.03:
-        radius = rng.uniform(0.06, 0.13)
-        debris = np.exp(-(((x - x_0) - 0.93 * length) ** 2 + (y - y_0) ** 2) / radius**2)
-        canvas.heights[index] += rng.uniform(0.04, 0.1) * debris
-
-
-def _xenopeltis_pit(canvas: Canvas, rng: np.random.Generator, x_0: float, y_0: float, length: float) -> None:
-    """Draw the pit between two fingers, deepest near their roots."""
-    pitch = canvas.pitch[1]
-    depth = rng.uniform(0.01, 0.03) if rng.uniform() < 0.1 else rng.uniform(0.04, 0.11)
-    start = 0.1 + rng.normal(0, 0.04)
-    span = rng.uniform(0.55, 0.8)
-    width = 0.17 * rng.uniform(0.7, 1.3)
-    tilt = rng.normal(0.03, 0.06) * pitch / length
-    index, x, y = canvas.window((x_0, x_0 + 1.1 * length), (y_0 - 0.9 * pitch, y_0 + 0.9 * pitch))
-    s = (x - x_0) / length
-    t = (y - y_0 - tilt * (x - x_0)) / pitch
-    u = np.clip((s - start) / span, 0, 1)
-    half = width * 2 * np.sqrt(u * (1 - u))  # an ellipse
-    pit = smooth_step(half - np.abs(t), 0.12) * smooth_step(s - start - 0.03, 0.04) * (1 - u) ** 0.7
-    canvas.heights[index] -= depth * pit
-
-
 PROFILES: dict[str, Callable[..., HeightField]] = {
     "blazed": blazed,
     "sinusoidal": sinusoidal,
@@ -771,14 +390,48 @@ PROFILES: dict[str, Callable[..., HeightField]] = {
     "film": film,
     "compact_disc": compact_disc,
     "dvd": dvd,
-    "elaphe": elaphe,
-    "xenopeltis": xenopeltis,
+    "elaphe_synthetic": elaphe_synthetic,
+    "xenopeltis_synthetic": xenopeltis_synthetic,
     "morpho_ridges": morpho_ridges,
 }
 """Name in recipes and scenes → function."""
 
+RENAMED = {name: f"{name}_synthetic" for name in ("elaphe", "xenopeltis")}
+"""Name of a profile until version 0.2 → its name now, as the measured skins have the former."""
+
+
+def profile_name(name: object) -> str:
+    """Return the name of a profile.
+
+    Raises:
+        RequestError: if there is no such profile.
+
+    Warns:
+        FutureWarning: if the name is a former one.
+    """
+    if isinstance(name, str) and name in RENAMED:
+        warnings.warn(
+            f"profile {name}: got the former name of {RENAMED[name]}, a synthetic skin; the measured one is the recipe "
+            f"{name}.toml. The former name will be refused from version 0.4 on",
+            FutureWarning,
+            stacklevel=2,
+        )
+        return RENAMED[name]
+    if not (isinstance(name, str) and name in PROFILES):
+        raise RequestError(
+            f"profile: got {name!r}, wanted one of {', '.join(PROFILES)}{did_you_mean(str(name), PROFILES)}"
+        )
+    return name
+
+
+def __getattr__(name: str) -> Callable[..., HeightField]:
+    if name in RENAMED:
+        return PROFILES[profile_name(name)]
+    raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+
+
 COHERENCE_LENGTHS: dict[str, float] = dict.fromkeys(
-    ("compact_disc", "dvd", "elaphe", "xenopeltis", "morpho_ridges"), 26.0
+    ("compact_disc", "dvd", "elaphe_synthetic", "xenopeltis_synthetic", "morpho_ridges"), 26.0
 )
 """Name of a random profile → coherence length in µm suitable for its default tile of about 32 µm.
 
@@ -786,7 +439,10 @@ The periodic patch has a comb of orders spaced by 1/32 cycles/µm; a coherence l
 them into the smooth haze of an irregular surface.
 """
 
-PATCHES: dict[str, int] = {"compact_disc": 48, "dvd": 48, "elaphe": 16, "xenopeltis": 16, "morpho_ridges": 16}
+PATCHES: dict[str, int] = {
+    **{"compact_disc": 48, "dvd": 48},
+    **{"elaphe_synthetic": 16, "xenopeltis_synthetic": 16, "morpho_ridges": 16},
+}
 """Name of a random profile → number of seeds over which its spectrum is averaged by default.
 
 At 550 nm and normal incidence ∫|ΔS| dq relative to the mean over infinitely many other seeds is then below 0.08; for

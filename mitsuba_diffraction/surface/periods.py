@@ -22,7 +22,7 @@ from scipy.fft import fft2
 from scipy.special import gammainccinv, gammaincinv
 
 from ..errors import check_whole
-from ..settings import Settings
+from ..settings import ScalarSettings
 from .heightfield import HeightField, harmonic_fill
 
 Array = NDArray[np.float64]
@@ -126,7 +126,7 @@ def find_periods(height_field: HeightField, count: int = 2, *, extent: str = "sa
         ValueError: if count is not a positive integer, or the extent is unknown.
     """
     check_whole("count", count, 1)
-    Settings(extent)
+    ScalarSettings(extent=extent)
     if extent == "tile":
         return _periods_of_tile(height_field, count)
     heights = harmonic_fill(height_field.heights, height_field.pixel_size)

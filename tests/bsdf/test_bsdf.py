@@ -28,8 +28,8 @@ MAKE = {
     "sinusoidal": lambda: md.gratings.sinusoidal(2.5, 0.3),
     "lamellar": lambda: md.gratings.lamellar(2.5, 0.2),
     "crossed": lambda: md.gratings.crossed(2.0, 0.1, samples=32),
-    "elaphe": lambda: md.gratings.elaphe(8),
-    "xenopeltis": lambda: md.gratings.xenopeltis(8),
+    "elaphe": lambda: md.gratings.elaphe_synthetic(8),
+    "xenopeltis": lambda: md.gratings.xenopeltis_synthetic(8),
 }
 
 

@@ -14,7 +14,7 @@ GRATINGS = {
     "coat": lambda: {**BLAZE, "material": "Al", "coat_ior": 1.5},
     "crossed": lambda: of_spectrum(spectrum("corner"), material="Cu"),
     "sample": lambda: of_spectrum(
-        md.precompute(md.gratings.elaphe(8), extent="sample", coherence_length=1.5),
+        md.precompute(md.gratings.elaphe_synthetic(8), extent="sample", coherence_length=1.5),
         material="Al",
         conserve_energy=False,  # E is looked up as that of crossed gratings
     ),

@@ -29,7 +29,7 @@ def sinusoidal():
 
 @functools.cache
 def continuum():
-    return md.precompute(md.gratings.elaphe(8.0), coherence_length=5.0)
+    return md.precompute(md.gratings.elaphe_synthetic(8.0), coherence_length=5.0)
 
 
 def number(value):

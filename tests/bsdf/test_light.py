@@ -7,7 +7,7 @@ from bsdf_support import albedo, direction, plugin
 
 import mitsuba_diffraction as md
 from mitsuba_diffraction.bsdf.base import gratings_in
-from mitsuba_diffraction.settings import Settings
+from mitsuba_diffraction.settings import ScalarSettings
 
 WAVELENGTHS = (450.0, 530.0, 600.0, 700.0)
 PROFILE = {"type": "diffraction_grating", "profile": "sinusoidal", "period": 2.5, "depth": 0.25}
@@ -183,7 +183,7 @@ def test_a_scene_without_a_sensor_is_refused_by_mitsuba(llvm):
 
 def test_the_error_of_scalar_theory_is_that_of_the_light_and_logged_once(llvm, caplog):
     relief = {"profile": "crossed", "period": 2.5, "depth": 0.35, "samples": 64}
-    settings = Settings(coherence_length=4.0, wavelengths=(240.0, 830.0), tolerance=0.1)
+    settings = ScalarSettings(coherence_length=4.0, wavelengths=(240.0, 830.0), tolerance=0.1)
     fine = {"type": "diffraction_grating", "spectrum": md.Recipe(relief, settings).build(), "conserve_energy": False}
 
     def warnings_of(film=None, **parameters):

@@ -23,11 +23,11 @@ def scalar(heights, **settings):
 SURFACES = {
     "resolved": scalar(lambda: md.gratings.blazed(2.5, 0.25), coherence_length=16.0),
     "overlapping": scalar(lambda: md.gratings.crossed(2.5, 0.25), coherence_length=4.0),
-    "spline": scalar(lambda: md.gratings.xenopeltis((9.0, 8.0)), extent="sample", coherence_length=4.0),
+    "spline": scalar(lambda: md.gratings.xenopeltis_synthetic((9.0, 8.0)), extent="sample", coherence_length=4.0),
     "line": scalar(
         lambda: md.HeightField(md.gratings.blazed(2.5, 0.25).heights.T, (2.5, 2.5 / 512)), coherence_length=5.0
     ),
-    "patches": scalar(lambda: [md.gratings.elaphe(8.0, seed=seed) for seed in (1, 2)], coherence_length=5.0),
+    "patches": scalar(lambda: [md.gratings.elaphe_synthetic(8.0, seed=seed) for seed in (1, 2)], coherence_length=5.0),
 }
 MODES = {
     "coat": {"material": "none", "coat_ior": INDEX, "ext_ior": 1.0},

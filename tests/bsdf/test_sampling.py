@@ -23,7 +23,7 @@ from bsdf_support import (
 import mitsuba_diffraction as md
 from mitsuba_diffraction import testing
 from mitsuba_diffraction.bsdf.continuum_sampler import BinSampler
-from mitsuba_diffraction.bsdf.geometry import Incidence, Interface
+from mitsuba_diffraction.bsdf.directions import Incidence, Interface
 from mitsuba_diffraction.bsdf.order_sampler import OrderSampler
 
 SKINS = "elaphe", "xenopeltis"  # slow to build
@@ -32,14 +32,14 @@ BUNDLED = {
     "sinusoidal": lambda: md.gratings.sinusoidal(2.5, 0.25),
     "lamellar": lambda: md.gratings.lamellar(2.5, 0.25),
     "crossed": lambda: md.gratings.crossed(2.5, 0.25),
-    "elaphe": lambda: md.gratings.elaphe(32.0, seed=1),
-    "xenopeltis": lambda: md.gratings.xenopeltis(32.0, seed=1),
+    "elaphe": lambda: md.gratings.elaphe_synthetic(32.0, seed=1),
+    "xenopeltis": lambda: md.gratings.xenopeltis_synthetic(32.0, seed=1),
 }
 SMALL = {
     **BUNDLED,
-    "elaphe": lambda: md.gratings.elaphe(8.0),
-    "xenopeltis": lambda: md.gratings.xenopeltis(8.0),
-    "sample": lambda: md.gratings.xenopeltis((9.0, 8.0)),
+    "elaphe": lambda: md.gratings.elaphe_synthetic(8.0),
+    "xenopeltis": lambda: md.gratings.xenopeltis_synthetic(8.0),
+    "sample": lambda: md.gratings.xenopeltis_synthetic((9.0, 8.0)),
     "column": lambda: md.HeightField(md.gratings.blazed(2.5, 0.246).heights.T, (2.5, 2.5 / 512)),
 }
 WIDE = {

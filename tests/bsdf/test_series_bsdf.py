@@ -201,7 +201,7 @@ def test_a_scene_gives_terms_as_text(tmp_path):
         ({"terms": 20}, "terms: got 20 with representation 'auto'"),
         ({"representation": "taylor", "terms": 0}, "terms: got 0"),
         (
-            {"profile": "elaphe", "size": 8.0, "patches": 2, "representation": "taylor"},
+            {"profile": "elaphe_synthetic", "size": 8.0, "patches": 2, "representation": "taylor"},
             "2 patches, wanted 'slices'",
         ),
     ],

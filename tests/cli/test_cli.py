@@ -457,7 +457,7 @@ def test_render_takes_the_samples_of_the_scene_and_writes_half_precision(command
     code, out, err = command(line)
     assert code == 0, err
     half, size = SpectralImage.load("out.exr").radiance, Path("out.exr").stat().st_size
-    assert f" s, {size / 1e6:.3g} MB\n" in out
+    assert f" s, {size / 1e3:.0f} kB\n" in out
     for name in ("out.exr", "out.png"):
         Path(name).unlink()
     code, _, err = command(f"{line} --float")

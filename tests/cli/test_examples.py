@@ -1,9 +1,13 @@
 """The examples that the package brings."""
 
+import importlib
 import re
 from pathlib import Path
 
 import pytest
+from PIL import Image
+
+hologram = importlib.import_module("mitsuba_diffraction.cli.hologram")  # the package has the command by this name
 
 
 def test_examples_are_copied_with_the_files_they_reference(command, tmp_path):
@@ -47,3 +51,26 @@ def test_a_file_instead_of_the_folder_is_one_line(command, where, tmp_path, monk
     code, _, error = command("examples", where)
     assert code == 2
     assert error.count("\n") == 1
+
+
+def test_a_hologram_is_a_scene_with_its_textures(command, tmp_path, monkeypatch):
+    rendered = []
+    monkeypatch.setattr(hologram, "render", lambda scene, preview, **options: rendered.append((scene, preview)))
+    monkeypatch.chdir(tmp_path)
+    Image.new("RGB", (30, 20), "red").save("me.png")
+    for _ in range(2):  # a second time, as the files are its own
+        code, said, error = command("hologram me.png")
+        assert code == 0, error
+    assert said.startswith("me_hologram/hologram.xml: a hologram of 16 × 9 cm, periods 0.7")
+    folder = Path("me_hologram")
+    assert rendered == 2 * [(folder / "hologram.xml", folder / "hologram.png")]
+    textures = {
+        f"models/{name}" for name in re.findall(r"models/(hologram_\w+\.exr)", (folder / "hologram.xml").read_text())
+    }
+    assert {path.relative_to(folder).as_posix() for path in folder.rglob("*.*")} == {"hologram.xml", *textures}
+    Path("other").mkdir()
+    Path("other/hologram.xml").write_text("<scene/>")
+    assert command("hologram me.png -o other")[0] == 2
+    assert Path("other/hologram.xml").read_text() == "<scene/>"
+    code, _, error = command("hologram other/hologram.xml")
+    assert (code, error.count("\n"), "got no picture" in error) == (2, 1, True)

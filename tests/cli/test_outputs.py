@@ -225,7 +225,8 @@ def test_bad_input_leaves_own_files_as_they_are(command, line, name, text):
 
 
 @pytest.mark.parametrize(
-    "name", ["a.json", "a.md", "a.csv", "a.png", "a.jpg", "a.pdf", "a.svg", "a.webp", "a.exr", "u.exr"]
+    "name",
+    ["a.json", "a.md", "a.csv", "a.png", "a.jpg", "a.pdf", "a.svg", "a.webp", "a.gif", "a.mp4", "a.exr", "u.exr"],
 )
 def test_every_format_carries_the_mark(name):
     if name == "a.json":
@@ -237,10 +238,8 @@ def test_every_format_carries_the_mark(name):
         save_markdown("# a\n", name)
     elif name == "a.csv":
         md.efficiencies(md.gratings.blazed(2.5, 0.25), [0], [500]).save_csv(name)
-    elif name == "a.webp":
-        from mitsuba_diffraction.render.turntable import save_animation
-
-        save_animation([Path("tex.png"), Path("scan.png")], name)
+    elif name in ("a.webp", "a.gif", "a.mp4"):
+        save_animation([Path("tex.png"), Path("tex.png")], Path(name))
     elif name in ("a.exr", "a.jpg"):
         from mitsuba_diffraction.render.spectral_image import SpectralImage, save_preview
 
@@ -369,10 +368,10 @@ def picture():
 
 
 WRITERS = {
-    "table.exr": lambda path: exr.write(path, "table", 1, {}, {"a": noise(4, 4)}, ""),
+    "table.exr": lambda path: exr.write_channels(path, "table", 1, {}, {"a": noise(4, 4)}, ""),
     "picture.exr": lambda path: picture().save(path),
     **{f"preview{suffix}": lambda path: save_preview(picture(), path) for suffix in (".png", ".jpg", ".tif", ".webp")},
-    "turn.webp": lambda path: save_animation(["frame.png"] * 2, path),
+    **{f"turn{suffix}": lambda path: save_animation(["frame.png"] * 2, path) for suffix in (".webp", ".gif", ".mp4")},
     "levels.gds": lambda path: makers.save_gds(levels(), path),
     "relief.tif": lambda path: output.save_tiff(md.gratings.foil(1.5, 0.2, samples=64), 0.2, path),
 }

@@ -23,7 +23,7 @@ MAKE = {
     "blazed": lambda: md.gratings.blazed(2.5, 0.25),
     "deep blazed": lambda: md.gratings.blazed(2.5, 0.8),
     "crossed": lambda: md.gratings.crossed(2.0, 0.1, samples=32),
-    "xenopeltis": lambda: md.gratings.xenopeltis(8),
+    "xenopeltis": lambda: md.gratings.xenopeltis_synthetic(8),
 }
 KINDS = {
     "mirror": {},

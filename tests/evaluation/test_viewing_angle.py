@@ -29,7 +29,7 @@ from viewing_angle import (
 import mitsuba_diffraction as md
 from mitsuba_diffraction.evaluation.realtime_shader.evaluate import relative_radiance
 from mitsuba_diffraction.evaluation.realtime_shader.quirks import Quirks
-from mitsuba_diffraction.settings import Settings
+from mitsuba_diffraction.settings import ScalarSettings
 
 ROOT = Path(__file__).parents[2]
 BLAZE = SURFACES["blaze"]
@@ -42,7 +42,7 @@ SKINS = {"elaphe": (1, 1.144), "xenopeltis": (0, 1.552)}
 def small_skin(name):
     axis, period = SKINS[name]
     surface = {"profile": name, "size": 12.0, "pixel_size": 0.085, "seed": 1}
-    recipe = md.Recipe(surface, Settings(coherence_length=10.0))
+    recipe = md.Recipe(surface, ScalarSettings(coherence_length=10.0))
     return PublishedSurface(name, recipe, axis, period, (1e3 * period, 0.0))
 
 

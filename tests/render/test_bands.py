@@ -249,7 +249,7 @@ def test_checkpoints_that_do_not_fit_on_the_disk_are_refused(three_bands, monkey
     monkeypatch.setattr(passes, "trace_pass", None)
     usage = passes.shutil.disk_usage(".")
     monkeypatch.setattr(passes.shutil, "disk_usage", lambda folder: usage._replace(free=10**4))
-    words = r"12 × 10 pixels, whose checkpoints take 6\.65e-05 GB of the disk, wanted at most the 1e-05 GB"
+    words = r"12 × 10 pixels, whose checkpoints take 67 kB of the disk, wanted at most the 10 kB"
     with pytest.raises(ValueError, match=words):
         render(write_scene(), spp=4, checkpoint="c")
 
@@ -266,6 +266,20 @@ def test_what_a_rendering_needs_is_announced_after_two_bands(three_bands, small_
     assert estimate.memory == 12 * (4 * (8 * 93 + 84 + 40) + 80)
     assert estimate.disk == 12 * 14 * (93 + 6) * 4  # one of four rows is written anew while the old one is there
     assert estimate.seconds == 160  # for 16 more
+
+
+def test_an_estimate_is_corrected_after_a_tenth_of_the_work(small_passes, monkeypatch):
+    """The second pass takes 10 s, all later ones 30 s: a sky above a snake."""
+    small_passes(11)
+    clock = itertools.accumulate(itertools.chain([0, 10], itertools.repeat(30)))
+    monkeypatch.setattr(passes, "time", SimpleNamespace(perf_counter=lambda: next(clock), monotonic=time.monotonic))
+    estimates = []
+    render(write_scene(), spp=60, announce=lambda estimate: estimates.append(estimate.seconds))
+    first, second = estimates
+    count = round(first / 10) + 2  # passes
+    done = -(-count // 10)
+    assert second == pytest.approx((10 + 30 * (done - 2)) / (done - 1) * (count - done))
+    assert 1 / 1.5 < second / (30 * (count - done)) < 1.5
 
 
 @pytest.mark.slow

@@ -178,6 +178,7 @@ def test_the_documentation_names_the_scenes_that_request_denoising():
             "anodised",
             "beetle",
             "blaze",
+            "scan",
             "projection",
         )
     }

@@ -11,6 +11,7 @@ import sys
 import time
 from pathlib import Path
 
+import imageio_ffmpeg
 import numpy as np
 import pytest
 from PIL import Image
@@ -471,8 +472,8 @@ def test_the_command_announces_long_renderings_and_takes_an_exposure(command, mo
     monkeypatch.setattr(module, "_MIN_ANNOUNCED_SECONDS", 0)
     code, out, err = command(f"{RENDER} -o out.exr --spp 4")
     assert code == 0
-    assert "16 × 16 pixels, 4 samples per pixel: about 0 min, 0.00022 GB of memory" in err
-    assert "a picture of 0.049 MB before compression" in err
+    assert "16 × 16 pixels, 4 samples per pixel: about 0 min, 224 kB of memory" in err
+    assert "a picture of 49 kB before compression" in err
     assert len(err.splitlines()) == 1
     assert re.search(r"exposed by \+?(-?\d+\.\d\d) stops \(--exposure \1\)", out)
     monkeypatch.setattr(module, "_HOUR", 1e-9)
@@ -630,18 +631,24 @@ def test_a_turntable_writes_frames_and_an_animation_and_resumes(command, monkeyp
     code, out, err = command(f"{line} --resume")
     assert (code, err) == (0, "")
     expected = {f"out_{number:03d}.{kind}" for number in range(3) for kind in ("exr", "png")}
-    assert files() == {"scene.xml", "out.webp", *expected}
+    assert files() == {"scene.xml", "out.webp", "out.gif", "out.mp4", *expected}
     assert Path("out_000.exr").stat().st_mtime_ns == first
     assert len({line.split("exposed by ")[1] for line in out.splitlines() if "exposure" in line}) == 1
     for number, motion in enumerate(orbit("scene.xml", 3)):
         picture = SpectralImage.load(f"out_{number:03d}.exr")
         np.testing.assert_array_equal(picture.radiance, render("scene.xml", spp=2, motion=motion).radiance)
-    with Image.open("out.webp") as animation:
-        assert (animation.n_frames, animation.size) == (3, (SIZE, SIZE))
-        for number in range(3):
-            animation.seek(number)
-            still = np.asarray(Image.open(f"out_{number:03d}.png"), dtype=float)
-            assert np.abs(np.asarray(animation.convert("RGB"), dtype=float) - still).mean() < 25
+    stills = [np.asarray(Image.open(f"out_{number:03d}.png"), dtype=float) for number in range(3)]
+    for name in ("out.webp", "out.gif"):
+        with Image.open(name) as animation:
+            assert (animation.n_frames, animation.size) == (3, (SIZE, SIZE))
+            for number in range(3):
+                animation.seek(number)
+                assert np.abs(np.asarray(animation.convert("RGB"), dtype=float) - stills[number]).mean() < 25
+    film = [imageio_ffmpeg.get_ffmpeg_exe(), "-i", "out.mp4", "-f", "rawvideo", "-pix_fmt", "rgb24", "-"]
+    found = subprocess.run(film, capture_output=True, check=True).stdout
+    shown = np.frombuffer(found, np.uint8).reshape(3, SIZE, SIZE, 3).astype(float)
+    for still, frame in zip(stills, shown, strict=True):
+        assert np.abs(frame - still).mean() < 25
 
 
 def test_a_second_ctrl_c_in_a_turntable_reports_completed_pictures(command, monkeypatch):
@@ -662,7 +669,7 @@ def test_a_second_ctrl_c_in_a_turntable_reports_completed_pictures(command, monk
 def test_a_turntable_of_pictures_alone(command):
     line = f"{RENDER} -o out.jpg --frames 2 --orbit --spp 1"
     assert command(line)[0] == 0
-    assert files() == {"scene.xml", "out.webp", "out_000.jpg", "out_001.jpg"}
+    assert files() == {"scene.xml", "out.webp", "out.gif", "out.mp4", "out_000.jpg", "out_001.jpg"}
     code, out, _ = command(f"{line} --resume")
     assert (code, out.count("complete, nothing to do")) == (0, 2)
 

@@ -8,17 +8,17 @@ import mitsuba_diffraction as md
 from mitsuba_diffraction import Recipe
 from mitsuba_diffraction.grating_spectrum import GratingSpectrum
 from mitsuba_diffraction.reference import order_powers, power_spectrum
-from mitsuba_diffraction.settings import Settings, lobe_width
+from mitsuba_diffraction.settings import ScalarSettings, lobe_width
 from mitsuba_diffraction.surface.gratings import COHERENCE_LENGTHS, PATCHES, PROFILES
 
-SURFACE = {"profile": "elaphe", "size": 7.0, "seed": 3}
+SURFACE = {"profile": "elaphe_synthetic", "size": 7.0, "seed": 3}
 GREEN = 4 * np.pi / 0.55
 """κ of 550 nm at normal incidence, rad/µm."""
 
 
 @pytest.fixture(scope="module")
 def recipe():
-    return Recipe({**SURFACE, "patches": 3}, Settings(coherence_length=5.6, tolerance=1e-3))
+    return Recipe({**SURFACE, "patches": 3}, ScalarSettings(coherence_length=5.6, tolerance=1e-3))
 
 
 @pytest.fixture(scope="module")
@@ -27,7 +27,7 @@ def spectrum(recipe):
 
 
 def test_patches_have_consecutive_seeds(recipe):
-    wanted = [PROFILES["elaphe"](7.0, seed=seed).digest for seed in (3, 4, 5)]
+    wanted = [PROFILES["elaphe_synthetic"](7.0, seed=seed).digest for seed in (3, 4, 5)]
     assert [field.digest for field in recipe.height_fields()] == wanted
     assert recipe.height_field().digest == wanted[0]
 
@@ -35,7 +35,7 @@ def test_patches_have_consecutive_seeds(recipe):
 def test_the_spectrum_is_the_mean_over_patches(recipe):
     fields = recipe.height_fields()
     # Lobes so narrow that the orders are not gathered on a lattice.
-    spectrum = Recipe(recipe.surface, Settings(coherence_length=60, tolerance=1e-3)).build()
+    spectrum = Recipe(recipe.surface, ScalarSettings(coherence_length=60, tolerance=1e-3)).build()
     m_x, m_y = spectrum.grid.axes()
     for kappa in np.array([0.0, 0.21, 0.47, 0.83, 1.0]) * spectrum.max_kappa:
         wanted = np.mean([order_powers(field, kappa)[np.ix_(m_y, m_x)] for field in fields], axis=0)
@@ -61,10 +61,10 @@ def test_a_saved_spectrum_records_the_number_of_patches(spectrum, tmp_path):
 
 
 def test_another_number_of_patches_is_another_spectrum(recipe):
-    digests = {Recipe({**SURFACE, "patches": n}, recipe.settings).digest() for n in (1, 2, PATCHES["elaphe"])}
+    digests = {Recipe({**SURFACE, "patches": n}, recipe.settings).digest() for n in (1, 2, PATCHES["elaphe_synthetic"])}
     assert len(digests) == 3
-    assert Recipe(SURFACE).patches == PATCHES["elaphe"]
-    assert Recipe(SURFACE, Settings(extent="sample")).patches == 1
+    assert Recipe(SURFACE).patches == PATCHES["elaphe_synthetic"]
+    assert Recipe(SURFACE, ScalarSettings(extent="sample")).patches == 1
     assert Recipe({"profile": "blazed"}).patches == Recipe({"scan": "a.png"}).patches == 1
     assert Recipe({**SURFACE, "patches": 1}).height_fields()[0].digest == Recipe(SURFACE).height_field().digest
 
@@ -91,7 +91,7 @@ def test_patches_repeat_and_are_of_one_size(recipe):
     with pytest.raises(ValueError, match="patches: got 3 with extent 'sample', wanted 1"):
         md.precompute(fields, extent="sample", coherence_length=2.0)
     with pytest.raises(ValueError, match="wanted patches of one size"):
-        md.precompute([fields[0], md.gratings.elaphe(9.0)])
+        md.precompute([fields[0], md.gratings.elaphe_synthetic(9.0)])
     with pytest.raises(ValueError, match="patches: got none"):
         md.precompute([])
 

@@ -1,6 +1,7 @@
 """The promise of a tolerance, measured against direct sums in float64, and the analytic gratings."""
 
 import importlib
+import inspect
 import tracemalloc
 
 import numpy as np
@@ -278,7 +279,7 @@ def test_deep_surfaces_keep_the_tolerance(depth):
 
 @pytest.mark.parametrize(("tolerance", "words"), [(1e-2, 1), (1e-3, 2), (1e-4, 4)])
 def test_slices_have_the_smallest_format_that_keeps_the_tolerance(tolerance, words):
-    spectrum = precompute(md.gratings.xenopeltis(8.0), tolerance=tolerance)
+    spectrum = precompute(md.gratings.xenopeltis_synthetic(8.0), tolerance=tolerance)
     assert spectrum.table.words_per_node == words
     assert spectrum.error <= tolerance
 
@@ -287,7 +288,7 @@ def test_slices_have_the_smallest_format_that_keeps_the_tolerance(tolerance, wor
 @pytest.mark.few(2)
 @pytest.mark.parametrize(("coherence_length", "lattice"), [(12.0, False), (8.0, False), (2.0, True), (0.7, True)])
 def test_a_tile_is_read_from_a_lattice_where_its_lobes_overlap_widely(coherence_length, lattice):
-    field = md.gratings.xenopeltis(8.0, seed=2)
+    field = md.gratings.xenopeltis_synthetic(8.0, seed=2)
     spectrum = precompute(field, coherence_length=coherence_length, tolerance=1e-2)
     assert isinstance(spectrum.grid, SplineGrid) == lattice
     assert spectrum.extent == "tile"
@@ -623,7 +624,7 @@ def test_too_large_a_table_is_refused(monkeypatch, extent):
 
 
 def test_a_table_too_large_in_one_format_takes_the_next(monkeypatch):
-    field = md.gratings.xenopeltis(8.0)
+    field = md.gratings.xenopeltis_synthetic(8.0)
     first = precompute(field, tolerance=1e-2).table
     assert first.words_per_node == 1
     module = importlib.import_module("mitsuba_diffraction.spectrum.build")
@@ -682,3 +683,15 @@ def test_building_takes_at_most_four_times_the_memory_of_the_result(extent):
     # One transform: a complex number for each pixel, or for each frequency of the lattice.
     transform = 16 * max(field.heights.size, int(np.prod(spectrum.grid.shape)))
     assert peak <= 4 * (spectrum.table.nbytes + transform), (peak, spectrum.table.nbytes, transform)
+
+
+def test_a_misspelt_parameter_is_refused_by_its_name():
+    with pytest.raises(TypeError, match=r"precompute\(\) got an unexpected keyword argument 'tolerence'"):
+        precompute(HeightField(np.zeros((4, 6)), 0.05), tolerence=0.1)
+
+
+def test_the_signature_has_the_parameters_of_both_theories():
+    found = {name: value.default for name, value in inspect.signature(precompute).parameters.items()}
+    assert list(found)[:2] == ["height_field", "progress"]
+    assert (found["theory"], found["extent"], found["coherence_length"], found["ext_ior"]) == ("scalar", "tile", 65, 1)
+    assert len(found) == 17

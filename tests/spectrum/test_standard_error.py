@@ -72,7 +72,7 @@ def test_a_uniform_axis_adds_no_standard_error():
 def test_the_standard_error_of_a_skin_is_right_within_a_factor_of_1_3(name, size, coherence_length):
     fields = []
     for seed in range(12):
-        skin = md.gratings.PROFILES[name](32.0, seed=seed)
+        skin = md.gratings.PROFILES[f"{name}_synthetic"](32.0, seed=seed)
         columns, rows = (int(size / p) for p in skin.pixel_size)
         fields.append(md.HeightField(skin.heights[:rows, :columns], skin.pixel_size))
     truth = spread(fields, coherence_length, KAPPA)

@@ -198,7 +198,7 @@ def test_a_grating_on_a_part_of_the_patch_is_found():
 @pytest.mark.parametrize(("name", "directions"), [("elaphe", (90, 0)), ("xenopeltis", (0, 90))])
 def test_the_rows_of_a_synthetic_skin_are_a_period(name, directions):
     # Its fingers wander, which the uncertainty shows.
-    skin = md.gratings.PROFILES[name](size=32.0, depth=0.375, seed=1)
+    skin = md.gratings.PROFILES[f"{name}_synthetic"](size=32.0, depth=0.375, seed=1)
     skin = HeightField(skin.heights[::2, ::2], 2 * skin.pixel_size[0])
     period = {"elaphe": 32 / 28, "xenopeltis": 32 / 21}[name]
     found = find_periods(skin)[0]

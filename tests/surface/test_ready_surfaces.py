@@ -8,7 +8,9 @@ import numpy as np
 import pytest
 from scipy.special import jv
 
+import mitsuba_diffraction as md
 from mitsuba_diffraction import Recipe
+from mitsuba_diffraction.recipe import source_named
 from mitsuba_diffraction.settings import lobe_width
 from mitsuba_diffraction.surface.gratings import (
     COHERENCE_LENGTHS,
@@ -251,8 +253,8 @@ def test_an_impossible_disc_is_refused(arguments, message):
         ("compact_disc", {"length": 1e7}),
         ("compact_disc", {"tracks": 10**9}),
         ("compact_disc", {"length": 1e308}),
-        ("elaphe", {"size": 1e5}),
-        ("xenopeltis", {"size": 1e308}),
+        ("elaphe_synthetic", {"size": 1e5}),
+        ("xenopeltis_synthetic", {"size": 1e308}),
         ("morpho_ridges", {"pixel_size": 1e-6}),
     ],
 )
@@ -302,9 +304,7 @@ def test_the_comb_of_a_random_tile_is_blurred(name):
 
 @pytest.mark.parametrize("name", sorted(COHERENCE_LENGTHS))
 def test_a_recipe_and_a_scene_agree_on_coherence_length_and_patches(name):
-    # The measured skins have the plain names.
-    file = f"{name}_synthetic.toml" if name in ("elaphe", "xenopeltis") else f"{name}.toml"
-    recipe = Recipe.load(RECIPES / file)
+    recipe = Recipe.load(RECIPES / f"{name}.toml")
     assert recipe.settings.coherence_length == COHERENCE_LENGTHS[name]
     assert recipe.surface["patches"] == PATCHES[name]
 
@@ -340,10 +340,53 @@ NAMED = {
     "transmission_600": {},
     "compact_disc": {"tracks": 2, "length": 13.0},
     "dvd": {"tracks": 2, "length": 8.0},
-    "elaphe": {"size": 7.0},
-    "xenopeltis": {"size": 6.0},
+    "elaphe_synthetic": {"size": 7.0},
+    "xenopeltis_synthetic": {"size": 6.0},
     "morpho_ridges": {"size": 4.2},
 }
+
+
+@pytest.mark.parametrize("skin", ["elaphe", "xenopeltis"])
+def test_a_skin_is_the_measured_one_and_its_synthetic_replica_says_so(skin):
+    with pytest.warns(FutureWarning, match=f"former name of {skin}_synthetic, a synthetic skin; the measured one is"):
+        recipe = Recipe({"profile": skin, "size": 7.0})
+    assert recipe.surface["profile"] == f"{skin}_synthetic"
+    assert "synthetic" in recipe.height_field().source
+    with pytest.warns(FutureWarning, match="former name"):
+        assert getattr(md.gratings, skin) is PROFILES[f"{skin}_synthetic"]
+    with pytest.warns(FutureWarning, match=f"{skin}: the measured skin; .* is {skin}_synthetic"):
+        measured = Recipe.load(source_named(skin))
+    assert measured.surface["scan"] == f"measured/{skin}_afm_65um.png"
+    assert not {"elaphe", "xenopeltis"} & PROFILES.keys()
+
+
+def test_a_name_is_a_profile_a_file_or_a_recipe_of_the_package(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    assert source_named("compact_disc") == "compact_disc"
+    assert source_named("gone.toml") == "gone.toml"
+    assert Path(source_named("elaphe_afm")).samefile(RECIPES / "elaphe_afm.toml")
+    Path("elaphe_afm").touch()
+    assert source_named("elaphe_afm") == "elaphe_afm"
+    with pytest.raises(
+        ValueError, match=r"^compact_disk: no file and no surface has this name; did you mean compact_disc\?$"
+    ):
+        source_named("compact_disk")
+    with pytest.raises(
+        ValueError, match=r"^qqq: no file and no surface has this name, wanted blazed, .*xenopeltis_afm"
+    ):
+        source_named("qqq")
+
+
+def test_a_scene_takes_a_profile_by_filename():
+    mi.set_variant("llvm_ad_spectral")
+    named, given = (
+        mi.load_dict({"type": "diffraction_grating", key: "blazed", "material": "Al", "tolerance": 0.1})
+        for key in ("filename", "profile")
+    )
+    assert named.spectrum is given.spectrum
+    for key in ("filename", "profile"):
+        with pytest.raises(RuntimeError, match=r"compact_disk.*; did you mean compact_disc"):
+            mi.load_dict({"type": "diffraction_grating", key: "compact_disk"})
 
 
 @pytest.mark.few(1)

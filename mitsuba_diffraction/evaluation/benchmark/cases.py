@@ -5,11 +5,11 @@ from __future__ import annotations
 import warnings
 from dataclasses import dataclass
 
-from ...cli.examples import source
+from ...files import examples_folder
 from ...grating_spectrum import GratingSpectrum
 from ...precomputation import precompute
 from ...recipe import Recipe
-from ...settings import SUN_COHERENCE_LENGTH, Settings
+from ...settings import SUN_COHERENCE_LENGTH, ScalarSettings, Settings
 from ...spectrum.sample import effective_coherence_length
 from ...surface import gratings
 from ...surface.heightfield import HeightField
@@ -53,15 +53,15 @@ class Case:
 def bundled_cases() -> list[Case]:
     """Return analytic gratings, the synthetic skins and the disc of the recipes, and 65 µm of skin with 512² pixels."""
     sun = SUN_COHERENCE_LENGTH
-    large = gratings.xenopeltis(65.0, pixel_size=65 / 512, seed=1)
+    large = gratings.xenopeltis_synthetic(65.0, pixel_size=65 / 512, seed=1)
     return [
         Case("blazed", gratings.blazed(2.5, 0.25), "tile", sun),
         Case("sinusoidal", gratings.sinusoidal(2.5, 0.3), "tile", sun),
         Case("lamellar", gratings.lamellar(2.5, 0.2), "tile", sun),
         Case("crossed", gratings.crossed(2.0, 0.1), "tile", sun),
-        # Coherence as in precompute/elaphe.toml and xenopeltis.toml.
-        Case("elaphe", gratings.elaphe(32.0, seed=1), "tile", 26.0),
-        Case("xenopeltis", gratings.xenopeltis(32.0, seed=1), "tile", 26.0),
+        # Coherence as in precompute/elaphe_synthetic.toml and xenopeltis_synthetic.toml.
+        Case("elaphe_synthetic", gratings.elaphe_synthetic(32.0, seed=1), "tile", 26.0),
+        Case("xenopeltis_synthetic", gratings.xenopeltis_synthetic(32.0, seed=1), "tile", 26.0),
         # As in precompute/compact_disc.toml.
         Case("compact disc", gratings.compact_disc(seed=1), "tile", 26.0),
         Case("65 µm tile", large, "tile", sun),
@@ -69,7 +69,7 @@ def bundled_cases() -> list[Case]:
     ]
 
 
-_MEASURED_FOLDER = source() / "precompute" / "measured"
+_MEASURED_FOLDER = examples_folder() / "precompute" / "measured"
 MEASURED = {"elaphe": 0.4347, "xenopeltis": 0.8187}
 """µm from black to white, of the scans of 65 µm in precompute/measured, as in the published maps."""
 _CROP = slice(333, 999)  # of 1332 rows and columns: the central 32.5 µm
@@ -97,11 +97,16 @@ def tiles() -> list[Case]:
     tile.
     """
     cases = [
-        Case(f"synthetic, {depth:g} µm", gratings.elaphe(8.0, depth=depth, seed=1), "tile", SUN_COHERENCE_LENGTH)
+        Case(
+            f"synthetic, {depth:g} µm",
+            gratings.elaphe_synthetic(8.0, depth=depth, seed=1),
+            "tile",
+            SUN_COHERENCE_LENGTH,
+        )
         for depth in (0.15, 0.375, 0.6)
     ]
     for name, height_range in MEASURED.items():
-        whole = scan(name, height_range, Settings()).height_field()
+        whole = scan(name, height_range, ScalarSettings()).height_field()
         field = HeightField(whole.heights[_CROP, _CROP], whole.pixel_size, source=f"centre of {whole.source}")
         cases.append(Case(f"measured {name.capitalize()}", field, "tile", SUN_COHERENCE_LENGTH))
     return cases

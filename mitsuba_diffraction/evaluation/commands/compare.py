@@ -10,9 +10,8 @@ from typing import Annotated
 import typer
 
 from ...cli.arguments import Define, Overwrite, Variant, check_suffix, scene_parameters
-from ...cli.examples import source as examples_folder
 from ...errors import RequestError
-from ...files import whole_file
+from ...files import examples_folder, whole_file
 from ...outputs import check_outputs, free_name, save_json
 from ...progress import progress_bar, say, show, tell
 from ...recipe import Recipe
@@ -62,7 +61,7 @@ def compare(
     from ..comparison import compare as run
     from ..comparison import summary
     from ..comparison.pictures import supported_lights
-    from ..realtime_shader.integrator import checked_brightness
+    from ..realtime_shader.diffraction_shader import checked_brightness
 
     number = None if brightness == "auto" else checked_brightness(_number(brightness))
     parameters, name = scene_parameters(define), scene.stem

@@ -19,6 +19,7 @@ from ...cli.arguments import (
 )
 from ...errors import RequestError
 from ...progress import progress_bar, show, tell
+from ...recipe import source_named
 
 if TYPE_CHECKING:
     from ...recipe import Recipe
@@ -28,7 +29,7 @@ if TYPE_CHECKING:
 def validate(
     context: typer.Context,
     surface: Annotated[
-        Path | None, typer.Argument(metavar="[SURFACE]", help="check only this recipe (.toml) or scan")
+        Path | None, typer.Argument(metavar="[SURFACE]", help="check only this recipe (.toml), profile or scan")
     ] = None,
     variant: Variant = None,
     json: Annotated[Path | None, typer.Option(help="save the results (.json)")] = None,
@@ -82,7 +83,7 @@ def validate(
 
 
 def _recipe(path: Path, of_scan: dict[str, object], settings: dict[str, object]) -> Recipe:
-    recipe = recipe_of(path, of_scan, settings)
+    recipe = recipe_of(Path(source_named(str(path))), of_scan, settings)
     if recipe.patches > 1:
         recipe = replace(recipe, surface={**recipe.surface, "patches": 1})
     if recipe.settings.theory == "rigorous":
