@@ -1,28 +1,56 @@
 """Spectra to colours: spectral radiance → CIE XYZ → linear sRGB → display.
 
-Observer: CIE 1931, 2°. Primaries and white point (D65) of sRGB (IEC 61966-2-1). All tables come from colour-science.
+Observer: CIE 1931, 2°, from colour-science. Primaries and white point (D65) of sRGB (IEC 61966-2-1).
 
 Scale: XYZ is divided by the Y of a flat spectrum of one, ∫ȳ dλ = 106.857 nm, so that a constant 1 W m⁻² sr⁻¹ nm⁻¹ has
 luminance 1, as in Mitsuba's RGB film. There is no chromatic adaptation: a flat spectrum is slightly pink relative to
 D65.
 
-colour-science is imported inside the functions that use it, because the import takes about a second, longer than a
-small rendering.
+colour-science is imported inside the functions that use it, because the import takes more than a second, as long as a
+small rendering. Renderings need the observer alone, which is kept in the cache.
 """
 
 from __future__ import annotations
 
 import os
 from collections.abc import Callable
-from functools import lru_cache
+from contextlib import suppress
+from functools import cache, lru_cache
+from importlib import metadata
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from .errors import RequestError
+from .files import UNSEALED, cache_folder, is_intact, seal, whole_file
 from .settings import VISIBLE
 
 _OBSERVER = "CIE 1931 2 Degree Standard Observer"
+_D65 = (0.3127, 0.3290)  # x and y
+
+# IEC 61966-2-1:1999
+XYZ_TO_SRGB = np.array([[3.2406, -1.5372, -0.4986], [-0.9689, 1.8758, 0.0415], [0.0557, -0.2040, 1.0570]])
+SRGB_TO_XYZ = np.array([[0.4124, 0.3576, 0.1805], [0.2126, 0.7152, 0.0722], [0.0193, 0.1192, 0.9505]])
+
+
+@cache
+def _observer() -> NDArray[np.float64]:
+    """Return λ in nm and x̄, ȳ, z̄ of the observer, (n, 4)."""
+    path = cache_folder() / f"observer-{metadata.version('colour-science')}.txt"
+    # A damaged file, or none.
+    with suppress(OSError, ValueError):
+        if is_intact(path):
+            return np.loadtxt(path)
+    import colour
+
+    cmfs = colour.MSDS_CMFS[_OBSERVER]
+    table = np.column_stack([cmfs.wavelengths, cmfs.values])
+    with suppress(OSError, RequestError):
+        path.parent.mkdir(parents=True, exist_ok=True)
+        with whole_file(path) as temporary:
+            np.savetxt(temporary, table, "%.17g", header=UNSEALED)
+            seal(temporary)
+    return table
 
 
 def matching_functions(wavelengths: ArrayLike) -> NDArray[np.float64]:
@@ -30,17 +58,13 @@ def matching_functions(wavelengths: ArrayLike) -> NDArray[np.float64]:
 
     They are interpolated linearly between the wavelengths of the observer and constant outside.
     """
-    import colour
-
-    cmfs = colour.MSDS_CMFS[_OBSERVER]
-    return np.stack([np.interp(np.asarray(wavelengths), cmfs.wavelengths, column) for column in cmfs.values.T], axis=1)
+    known, *columns = _observer().T
+    return np.stack([np.interp(np.asarray(wavelengths), known, column) for column in columns], axis=1)
 
 
 @lru_cache(maxsize=8)
 def _xyz_matrix(wavelengths: tuple[float, ...]) -> NDArray[np.float64]:
     """Return the matrix m of `spectrum_to_XYZ`, (n, 3)."""
-    import colour
-
     centres = np.asarray(wavelengths)
     steps = np.diff(centres)
     if centres.size < 2 or steps[0] < 1 or np.ptp(steps) > 1e-3 * steps[0]:
@@ -50,7 +74,8 @@ def _xyz_matrix(wavelengths: tuple[float, ...]) -> NDArray[np.float64]:
         )
     step = float(np.mean(steps))
     if centres[0] - step >= VISIBLE[1] or centres[-1] + step <= VISIBLE[0]:
-        white = colour.xy_to_XYZ(colour.CCS_ILLUMINANTS[_OBSERVER]["D65"])
+        x, y = _D65
+        white = np.array([x / y, 1, (1 - x - y) / y])
         return np.tile(white / centres.size, (centres.size, 1))
     spacing = 0.25
     fine = np.arange(VISIBLE[0], VISIBLE[1] + spacing / 2, spacing)
@@ -99,16 +124,12 @@ def spectrum_to_linear_sRGB(radiance: ArrayLike, wavelengths: ArrayLike) -> NDAr
 
 def XYZ_to_linear_sRGB(XYZ: NDArray[np.floating]) -> NDArray[np.float64]:
     """Convert XYZ to linear sRGB, (..., 3) each; negative components outside the gamut."""
-    import colour
-
-    return XYZ @ colour.RGB_COLOURSPACES["sRGB"].matrix_XYZ_to_RGB.T
+    return XYZ @ XYZ_TO_SRGB.T
 
 
 def linear_sRGB_to_XYZ(rgb: NDArray[np.floating]) -> NDArray[np.float64]:
     """Convert linear sRGB to XYZ, (..., 3) each."""
-    import colour
-
-    return rgb @ colour.RGB_COLOURSPACES["sRGB"].matrix_RGB_to_XYZ.T
+    return rgb @ SRGB_TO_XYZ.T
 
 
 def delta_E(XYZ_1: ArrayLike, XYZ_2: ArrayLike) -> NDArray[np.float64]:
@@ -201,11 +222,9 @@ def into_gamut(rgb: NDArray[np.floating]) -> NDArray[np.float64]:
     wavelength. Clamping each channel at zero would instead brighten spectral colours, above all cyan and violet. The
     result is black where the luminance is not positive or a value is not finite. Both are linear sRGB, (..., 3).
     """
-    import colour
-
     rgb = np.asarray(rgb, dtype=np.float64)
     rgb = np.where(np.isfinite(rgb).all(axis=-1, keepdims=True), rgb, 0.0)
-    luminance = rgb @ colour.RGB_COLOURSPACES["sRGB"].matrix_RGB_to_XYZ[1]
+    luminance = rgb @ SRGB_TO_XYZ[1]
     luminance = np.maximum(luminance, 0.0)[..., None]
     min_value = np.minimum(rgb.min(axis=-1, keepdims=True), 0.0)
     span = luminance - min_value
@@ -256,16 +275,17 @@ ViewTransform = Callable[[NDArray[np.floating]], NDArray[np.floating]]
 
 def neutral_view(rgb: NDArray[np.floating]) -> NDArray[np.floating]:
     """Encode exposed, non-negative linear sRGB for a display: `roll_off`, transfer function of sRGB."""
-    import colour
-
-    return colour.cctf_encoding(roll_off(rgb), function="sRGB")
+    return _encoded(roll_off(rgb))
 
 
 def plain_view(rgb: NDArray[np.floating]) -> NDArray[np.floating]:
     """Encode exposed, non-negative linear sRGB for a display: the transfer function of sRGB alone, clipped at one."""
-    import colour
+    return _encoded(np.minimum(rgb, 1.0))
 
-    return colour.cctf_encoding(np.minimum(rgb, 1.0), function="sRGB")
+
+def _encoded(rgb: NDArray[np.floating]) -> NDArray[np.floating]:
+    """Apply the transfer function of sRGB (IEC 61966-2-1) to values that are not negative."""
+    return np.where(rgb <= 0.0031308, 12.92 * rgb, 1.055 * rgb ** (1 / 2.4) - 0.055)
 
 
 def ocio_view(name: str) -> ViewTransform:
@@ -295,12 +315,10 @@ def ocio_view(name: str) -> ViewTransform:
         transform = config.getProcessor("cie_xyz_d65_interchange", display, view, ocio.TRANSFORM_DIR_FORWARD)
     except (ocio.Exception, ocio.ExceptionMissingFile) as error:
         raise RequestError(f"--view: {source} cannot be used by OpenColorIO ({' '.join(str(error).split())})") from None
-    import colour
-
-    processor, to_XYZ = transform.getDefaultCPUProcessor(), colour.RGB_COLOURSPACES["sRGB"].matrix_RGB_to_XYZ
+    processor = transform.getDefaultCPUProcessor()
 
     def shown(rgb: NDArray[np.floating]) -> NDArray[np.floating]:
-        values = np.ascontiguousarray(rgb @ to_XYZ.T, np.float32)
+        values = np.ascontiguousarray(linear_sRGB_to_XYZ(rgb), np.float32)
         processor.applyRGB(values)
         return values
 
@@ -314,7 +332,5 @@ def on_screen(rgb: NDArray[np.floating], view: ViewTransform = neutral_view) -> 
 
 def hex_code(rgb: NDArray[np.floating]) -> str:
     """Return the sRGB code, "#ffc08a", of non-negative linear sRGB (3,), its brightest component scaled to one."""
-    import colour
-
-    shown = colour.cctf_encoding(rgb / max(rgb.max(), 1e-300), function="sRGB")
+    shown = _encoded(rgb / max(rgb.max(), 1e-300))
     return "#" + bytes(np.round(255 * shown).astype(np.uint8)).hex()

@@ -18,6 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import fft
 
+from ..color import SRGB_TO_XYZ
 from ..errors import RequestError
 from .film import Rows
 from .spectral_image import split_rows
@@ -119,15 +120,13 @@ def _response(kernel: mi.ReconstructionFilter, size: int) -> NDArray[np.float64]
 
 def denoised(XYZ: NDArray[np.floating], guide: Guides) -> NDArray[np.float64]:
     """Denoise a picture, XYZ of any scale, (rows, columns, 3), by guides of the same pixels."""
-    import colour
     import pyoidn
 
     # Denoised in XYZ, where no visible colour has a negative component. In an RGB space that contains all of them, the
     # luminance of violet light is a small difference of channels. Denoising loses this difference: violet pixels become
     # black.
-    to_XYZ = colour.RGB_COLOURSPACES["sRGB"].matrix_RGB_to_XYZ
-    white = to_XYZ.sum(1)  # divisor of XYZ, so that grey has equal channels
-    albedo = np.ascontiguousarray(guide.albedo @ (to_XYZ.T / white), np.float32)
+    white = SRGB_TO_XYZ.sum(1)  # divisor of XYZ, so that grey has equal channels
+    albedo = np.ascontiguousarray(guide.albedo @ (SRGB_TO_XYZ.T / white), np.float32)
     uncorrelated = fft.idctn(fft.dctn(XYZ / white, axes=(0, 1)) / guide.response, axes=(0, 1))
     noisy = np.ascontiguousarray(uncorrelated, np.float32)
     result = pyoidn.denoise(noisy, albedo=albedo, normal=guide.normals, hdr=True)

@@ -5,6 +5,7 @@ import numpy as np
 import pytest
 from PIL import Image
 
+from mitsuba_diffraction import color
 from mitsuba_diffraction.color import (
     auto_exposure,
     delta_E,
@@ -22,7 +23,8 @@ from mitsuba_diffraction.render.spectral_image import SpectralImage, save_previe
 
 GRID = np.arange(365.0, 830.0, 5.0)
 FINE = np.arange(360.0, 831.0)
-CMFS = colour.MSDS_CMFS["CIE 1931 2 Degree Standard Observer"]
+OBSERVER = "CIE 1931 2 Degree Standard Observer"
+CMFS = colour.MSDS_CMFS[OBSERVER]
 LUMINANCE = colour.RGB_COLOURSPACES["sRGB"].matrix_RGB_to_XYZ[1]
 
 
@@ -228,3 +230,26 @@ def test_spectra_of_colours_are_those_of_another_implementation():
 def test_light_of_a_laser_is_grey():
     assert lamp_to_linear_sRGB(np.array([532.0])) == pytest.approx(np.ones((1, 3)))
     assert upsampled(np.full((2, 3), 0.3), np.ones((1, 3))) == pytest.approx(np.full((2, 1), 0.3), abs=1e-6)
+
+
+def test_srgb_is_as_in_colour_science():
+    values = np.append(np.linspace(0, 0.01, 50), np.linspace(0, 1, 50)).reshape(-1, 1)
+    np.testing.assert_allclose(color.plain_view(values), colour.cctf_encoding(values, function="sRGB"), atol=1e-12)
+    np.testing.assert_array_equal(color.XYZ_TO_SRGB, colour.RGB_COLOURSPACES["sRGB"].matrix_XYZ_to_RGB)
+    np.testing.assert_array_equal(color.SRGB_TO_XYZ, colour.RGB_COLOURSPACES["sRGB"].matrix_RGB_to_XYZ)
+    ultraviolet, white = spectrum_to_XYZ(np.eye(2), [250.0, 255.0]), colour.CCS_ILLUMINANTS[OBSERVER]["D65"]
+    np.testing.assert_allclose(ultraviolet, np.tile(colour.xy_to_XYZ(white) / 2, (2, 1)), rtol=1e-12)
+
+
+def test_the_observer_is_read_from_the_cache_unless_it_is_damaged(tmp_path, monkeypatch):
+    monkeypatch.setenv("MITSUBA_DIFFRACTION_CACHE", str(tmp_path / "new"))
+    observer = color._observer.__wrapped__
+    observer()
+    (file,) = (tmp_path / "new").iterdir()
+    monkeypatch.setitem(sys.modules, "colour", None)
+    np.testing.assert_array_equal(observer(), np.column_stack([CMFS.wavelengths, CMFS.values]))
+    content = file.read_bytes()
+    for damaged in (content.replace(b"7", b"8", 1), content[:-100], b""):
+        file.write_bytes(damaged)
+        with pytest.raises(ImportError):
+            observer()
