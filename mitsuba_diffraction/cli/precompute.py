@@ -11,7 +11,7 @@ from ..errors import RequestError
 from ..grating_spectrum import GratingSpectrum
 from ..outputs import check_outputs
 from ..precomputation import Spectrum
-from ..progress import durations, progress_bar, stage, tell
+from ..progress import bytes_text, durations, progress_bar, stage, tell
 from ..recipe import Recipe, source_named
 from ..rigorous.rigorous_spectrum import RigorousSpectrum
 from ..settings import ORIGINS, REPRESENTATIONS, SUN_COHERENCE_LENGTH, THEORIES
@@ -56,6 +56,9 @@ def precompute(
         float | None, typer.Option(help="maximum angle of incidence or exit in the scene, degrees; default: 90")
     ] = None,
     largest_height_range: Annotated[float | None, typer.Option(help="refuse deeper surfaces, µm; default: 20")] = None,
+    verbose: Annotated[
+        bool, typer.Option("--verbose", help="print the steps of preparation, the grid, and what is truncated, too")
+    ] = False,
     overwrite: Overwrite = False,
 ) -> None:
     """Compute the power spectrum of the phase from recipes, profiles or scans."""
@@ -80,38 +83,44 @@ def precompute(
     with durations():
         seams = ["" if is_sure else _seam(source, recipe) for source, recipe in zip(sources, recipes, strict=True)]
         for source, recipe, target, seam in zip(sources, recipes, targets, seams, strict=True):
-            _precompute(source, recipe, target, seam)
+            _precompute(source, recipe, target, seam, verbose)
 
 
-def _precompute(source: Path, recipe: Recipe, target: Path, seam: str) -> None:
+def _precompute(source: Path, recipe: Recipe, target: Path, seam: str, verbose: bool) -> None:
     """Compute, save and report one spectrum."""
     with progress_bar(f"spectrum of {source.name}", "%") as progress:
         spectrum = recipe.build(progress)
         with stage("writing"):
             spectrum.save(target)
-    tell(
-        f"{target}: {spectrum.source}; {spectrum.extent}, {spectrum.grid}; coherence length "
-        f"{spectrum.coherence_length:.4g} µm; {_table_summary(spectrum)}{seam}"
-    )
+    tell(f"{target}: {recipe.summary()}; {_errors(spectrum)}; {bytes_text(1e6 * spectrum.megabytes)}{seam}")
+    if verbose:
+        tell(_details(spectrum))
     for text in (spectrum.excess, spectrum.warning) if isinstance(spectrum, GratingSpectrum) else ():
         if text:
             tell(f"! {text}")
 
 
-def _table_summary(spectrum: Spectrum) -> str:
-    size, tolerance = f"{spectrum.megabytes:.3g} MB", f"(tolerance {spectrum.tolerance:.3g})"
+def _errors(spectrum: Spectrum) -> str:
+    tolerance = f"(tolerance {spectrum.tolerance:.3g})"
+    if isinstance(spectrum, RigorousSpectrum):
+        return f"{spectrum.material_name}, rigorous theory; mean error {spectrum.error:.1e} {tolerance}"
+    scatter = f", standard error of one scan {spectrum.standard_error:.2g}" if spectrum.extent == "sample" else ""
+    return f"error {spectrum.error:.1e} {tolerance}{scatter}"
+
+
+def _details(spectrum: Spectrum) -> str:
+    about = (
+        f"{spectrum.source}\n{spectrum.extent}, {spectrum.grid}; coherence length {spectrum.coherence_length:.4g} µm\n"
+    )
     if isinstance(spectrum, RigorousSpectrum):
         return (
-            f"rigorous, {spectrum.material_name}, {size}, mean error {spectrum.error:.1e} {tolerance}\n"
-            f"maximum error {spectrum.max_error:.1e} of the reflected light, {spectrum.max_error_near:.1e} near a "
-            "Rayleigh anomaly"
+            f"{about}maximum error {spectrum.max_error:.1e} of the reflected light, {spectrum.max_error_near:.1e} near "
+            "a Rayleigh anomaly"
             + ("" if spectrum.mueller is None else f"; Mueller matrices, mean {spectrum.polarisation_error:.1e}")
         )
-    scatter = f", standard error of one scan {spectrum.standard_error:.2g}" if spectrum.extent == "sample" else ""
     return (
-        f"{spectrum.representation}, {size}, error {spectrum.error:.1e} {tolerance}{scatter}\n"
-        f"truncated, at most: {spectrum.truncated_power:.1e} of the power at weak frequencies; "
-        f"{spectrum.unresolved_power:.1e} at frequencies that no direction reaches or no pixel resolves"
+        f"{about}{spectrum.representation}; truncated, at most: {spectrum.truncated_power:.1e} of the power at weak "
+        f"frequencies; {spectrum.unresolved_power:.1e} at frequencies that no direction reaches or no pixel resolves"
     )
 
 
