@@ -75,12 +75,15 @@ class GratingSpectrum(PowerSpectrum):
 
     @property
     def summary(self) -> str:
-        """The table and its errors, in two lines."""
-        size, tolerance = f"{self.megabytes:.3g} MB", f"(tolerance {self.tolerance:.3g})"
+        """Its error."""
         scatter = "" if self.standard_error is None else f", standard error of one scan {self.standard_error:.2g}"
+        return f"error {self.error:.1e} (tolerance {self.tolerance:.3g}){scatter}"
+
+    @property
+    def details(self) -> str:
+        """The table, and what it leaves out."""
         return (
-            f"{self.representation}, {size}, error {self.error:.1e} {tolerance}{scatter}\n"
-            f"truncated, at most: {self.truncated_power:.1e} of the power at weak frequencies; "
+            f"{self.representation}; truncated, at most: {self.truncated_power:.1e} of the power at weak frequencies; "
             f"{self.unresolved_power:.1e} at frequencies that no direction reaches or no pixel resolves"
         )
 

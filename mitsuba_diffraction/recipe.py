@@ -257,6 +257,17 @@ class Recipe:
         except RequestError as error:
             raise RequestError(f"{path}: {error}") from None
 
+    def summary(self) -> str:
+        """Return what the surface is, its size and its depth."""
+        field = self.height_field()
+        size = " × ".join(f"{length:.4g}" for length in field.tile_size[: 2 if field.shape[0] > 1 else 1])
+        kind = "tile of" if "scan" in self.surface else "period"
+        if self.settings.extent == "sample":
+            kind = "sample of an irregular surface,"
+        if self.patches > 1:
+            kind = f"{self.patches} random patches of"
+        return f"{kind} {size} µm, {field.height_range:.3g} µm deep"
+
     def check(self) -> None:
         """Read or compute the surface, which checks its values, unless its spectrum is in the package or the cache.
 

@@ -16,6 +16,7 @@ from ..peaks import check_request, peak_efficiencies
 from ..precomputation import load_spectrum
 from ..progress import progress_bar, tell
 from ..recipe import Recipe, parameters_of_profile
+from ..scalar_theory import scalar_error
 from ..settings import ScalarSettings
 from .arguments import (
     Overwrite,
@@ -103,6 +104,7 @@ def efficiency(
             raise RequestError(f"{name}: got a spectrum of rigorous theory, wanted its recipe")
         with progress_bar(f"peaks of {name}") as progress:
             found = peak_efficiencies(cached, angles, wavelengths, **material_of, progress=progress)
+        warning = cached.warning
     else:
         with progress_bar(f"efficiencies of {name}") as progress:
             found = efficiencies(
@@ -114,7 +116,10 @@ def efficiency(
                 **material_of,
                 progress=progress,
             )
+            warning = scalar_error(recipe.height_field()).warning if theory == "scalar" else ""
     tell(str(found))
+    if warning:
+        tell(f"! {warning.replace('theory=rigorous', '--theory rigorous')}")
     if csv is not None:
         found.save_csv(csv)
         tell(f"{csv}: all numbers")

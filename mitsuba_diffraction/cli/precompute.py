@@ -9,7 +9,7 @@ import typer
 
 from ..errors import RequestError
 from ..outputs import check_outputs
-from ..progress import durations, progress_bar, stage, tell
+from ..progress import bytes_text, durations, progress_bar, stage, tell
 from ..recipe import Recipe, source_named
 from ..settings import ORIGINS, REPRESENTATIONS, SUN_COHERENCE_LENGTH, THEORIES
 from ..surface.prepare import is_seam_visible, seam_steps
@@ -53,6 +53,9 @@ def precompute(
         float | None, typer.Option(help="maximum angle of incidence or exit in the scene, degrees; default: 90")
     ] = None,
     largest_height_range: Annotated[float | None, typer.Option(help="refuse deeper surfaces, µm; default: 20")] = None,
+    verbose: Annotated[
+        bool, typer.Option("--verbose", help="print the steps of preparation, the grid, and what is truncated, too")
+    ] = False,
     overwrite: Overwrite = False,
 ) -> None:
     """Compute the power spectrum of the phase from recipes, profiles or scans."""
@@ -77,19 +80,19 @@ def precompute(
     with durations():
         seams = ["" if is_sure else _seam(source, recipe) for source, recipe in zip(sources, recipes, strict=True)]
         for source, recipe, target, seam in zip(sources, recipes, targets, seams, strict=True):
-            _precompute(source, recipe, target, seam)
+            _precompute(source, recipe, target, seam, verbose)
 
 
-def _precompute(source: Path, recipe: Recipe, target: Path, seam: str) -> None:
+def _precompute(source: Path, recipe: Recipe, target: Path, seam: str, verbose: bool) -> None:
     """Compute, save and report one spectrum."""
     with progress_bar(f"spectrum of {source.name}", "%") as progress:
         spectrum = recipe.build(progress)
         with stage("writing"):
             spectrum.save(target)
-    tell(
-        f"{target}: {spectrum.source}; {spectrum.extent}, {spectrum.grid}; coherence length "
-        f"{spectrum.coherence_length:.4g} µm; {spectrum.summary}{seam}"
-    )
+    tell(f"{target}: {recipe.summary()}; {spectrum.summary}; {bytes_text(1e6 * spectrum.megabytes)}{seam}")
+    if verbose:
+        coherence_length = f"coherence length {spectrum.coherence_length:.4g} µm"
+        tell(f"{spectrum.source}\n{spectrum.extent}, {spectrum.grid}; {coherence_length}\n{spectrum.details}")
     for concern in spectrum.concerns:
         tell(f"! {concern}")
 

@@ -323,12 +323,15 @@ class RigorousSpectrum:
 
     @property
     def summary(self) -> str:
-        """The table and its errors, in two lines."""
+        """The material and the error."""
+        return f"{self.material_name}, rigorous theory; mean error {self.error:.1e} (tolerance {self.tolerance:.3g})"
+
+    @property
+    def details(self) -> str:
+        """The largest errors."""
         return (
-            f"rigorous, {self.material_name}, {self.megabytes:.3g} MB, mean error {self.error:.1e} (tolerance "
-            f"{self.tolerance:.3g})\nmaximum error {self.max_error:.1e} of the reflected light, "
-            f"{self.max_error_near:.1e} near a Rayleigh anomaly"
-            + ("" if self.mueller is None else f"; Mueller matrices, mean {self.polarisation_error:.1e}")
+            f"maximum error {self.max_error:.1e} of the reflected light, {self.max_error_near:.1e} near a Rayleigh "
+            "anomaly" + ("" if self.mueller is None else f"; Mueller matrices, mean {self.polarisation_error:.1e}")
         )
 
     @property

@@ -128,12 +128,8 @@ def _summary(surface: Surface) -> str:
     """Return what the surface is, in one line."""
     if surface.recipe is None:
         return f"Saved spectrum, coherence length {surface.spectrum.coherence_length:.3g} µm."
-    field = surface.recipe.height_field()
-    size = " × ".join(f"{length:.3g}" for length in field.tile_size[: 2 if field.shape[0] > 1 else 1])
-    kind = "Period" if surface.recipe.settings.extent == "tile" else "Sample of an irregular surface,"
-    if surface.spectrum.patches > 1:
-        kind = f"{surface.spectrum.patches} random patches of"
-    return f"{kind} {size} µm, {field.height_range:.3g} µm deep."
+    summary = surface.recipe.summary()
+    return f"{summary[0].upper()}{summary[1:]}."
 
 
 def _shape(surface: Surface) -> str:

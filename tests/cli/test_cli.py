@@ -167,14 +167,16 @@ def test_precompute_writes_the_file_that_it_names_and_prints_its_error(command):
     Path("blaze.toml").write_text(BLAZE.replace("0.2", "0.25"))
     code, out, err = command("precompute blaze.toml --coherence-length 65")
     assert (code, err.strip()) == (0, "")
+    line = r"blaze.exr: period 2.5 µm, 0.\d+ µm deep; error \d\.\de-\d\d \(tolerance 0.001\); \d\.\d kB\n"
+    assert re.fullmatch(line, out)
+    code, out, _ = command("precompute blaze.toml --coherence-length 65 --verbose")
     spectrum = md.GratingSpectrum.load("blaze.exr")
     assert out.startswith("blaze.exr: ")
-    assert len(out.splitlines()) == 2
-    for part in ("blazed grating", "2.5 × 2.5 µm", "27 × 1 orders", "MB", f"error {spectrum.error:.1e}", "0.001"):
+    assert len(out.splitlines()) == 4
+    for part in ("blazed grating", "2.5 × 2.5 µm", "27 × 1 orders", "kB", f"error {spectrum.error:.1e}", "0.001"):
         assert part in out
     assert "tile, " in out
-    assert "coherence length 65 µm; slices, " in out
-    assert out.splitlines()[1].startswith("truncated, at most: 0.0e+00 of the power at weak frequencies; ")
+    assert "coherence length 65 µm\nslices; truncated, at most: 0.0e+00 of the power at weak frequencies; " in out
     # All but the orders up to 13, the last one below 2/λ: summed here.
     kappa = np.linspace(0, spectrum.max_kappa, 2000)[:, None]
     eta = [
@@ -189,7 +191,7 @@ def test_precompute_writes_the_file_that_it_names_and_prints_its_error(command):
 def test_precompute_takes_a_sample_by_options(command):
     code, out, err = command(
         "precompute wide.npy --pixel-size 0.09 --extent sample --largest-angle 60 --tolerance 0.02 -o out.exr "
-        "--representation slices"
+        "--representation slices --verbose"
     )
     assert code == 0
     messages = err.splitlines()
@@ -208,7 +210,7 @@ def test_precompute_takes_a_sample_by_options(command):
 
 
 def test_a_smaller_angle_takes_fewer_orders(command):
-    code, out, _ = command("precompute blaze.toml --largest-angle 29")
+    code, out, _ = command("precompute blaze.toml --largest-angle 29 --verbose")
     assert code == 0
     assert "13 × 1 orders" in out
     assert md.GratingSpectrum.load("blaze.exr").largest_angle == 29.0
@@ -241,9 +243,9 @@ def test_scans_are_read_with_their_scale(command):
 
 
 def test_missing_pixels_of_a_scan_are_filled_on_request(command):
-    code, out, _ = command("precompute holed.npy --extent tile --pixel-size 0.05 --fill-missing -o out.exr")
+    code, out, _ = command("precompute holed.npy --extent tile --pixel-size 0.05 --fill-missing -o out.exr --verbose")
     assert code == 0
-    assert "out.exr: holed.npy (1 missing pixel filled); " in out
+    assert "\nholed.npy (1 missing pixel filled)\n" in out
     spectrum = md.GratingSpectrum.load("out.exr")
     assert spectrum.source == "holed.npy (1 missing pixel filled)"
     assert spectrum.source_digest == md.HeightField(np.load("holed.npy"), 0.05, fill_missing=True).digest

@@ -14,7 +14,7 @@ from pathlib import Path
 from live_browser import draw, opened
 from live_pages import SURFACES
 
-FRAMES = 24
+FRAMES = 16
 
 
 def main() -> None:
