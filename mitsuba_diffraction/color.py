@@ -250,7 +250,7 @@ def auto_exposure(rgb: NDArray[np.floating]) -> float:
     return float(1 / np.percentile(lit, 97))
 
 
-View = Callable[[NDArray[np.floating]], NDArray[np.floating]]
+ViewTransform = Callable[[NDArray[np.floating]], NDArray[np.floating]]
 """Exposed linear sRGB, (..., 3) → values for a display, 0 to 1."""
 
 
@@ -268,7 +268,7 @@ def plain_view(rgb: NDArray[np.floating]) -> NDArray[np.floating]:
     return colour.cctf_encoding(np.minimum(rgb, 1.0), function="sRGB")
 
 
-def ocio_view(name: str) -> View:
+def ocio_view(name: str) -> ViewTransform:
     """Return a view of OpenColorIO for its default display, such as the filmic curve of ACES.
 
     The configuration comes from $OCIO. Without $OCIO it is the one built into OpenColorIO (ACES for computer graphics).
@@ -307,7 +307,7 @@ def ocio_view(name: str) -> View:
     return shown
 
 
-def on_screen(rgb: NDArray[np.floating], view: View = neutral_view) -> NDArray[np.uint8]:
+def on_screen(rgb: NDArray[np.floating], view: ViewTransform = neutral_view) -> NDArray[np.uint8]:
     """Encode exposed, non-negative linear sRGB for a display, 8 bits."""
     return np.round(255 * np.clip(view(rgb), 0.0, 1.0)).astype(np.uint8)
 

@@ -18,7 +18,7 @@ from .materials import RefractiveIndex, index_of, refractive_index
 from .outputs import MARK, METADATA
 from .progress import Progress, silent
 from .rigorous.coordinate_transformation import curve_of, is_profile
-from .rigorous.efficiencies import sheet_orders
+from .rigorous.solver import sheet_orders
 from .scalar_theory import incident_direction, profile_powers, scalar_orders, tile_powers, transmitted_orders
 from .settings import THEORIES, TRANSMISSIONS
 from .surface.heightfield import HeightField
@@ -225,8 +225,8 @@ def efficiencies(
     """
     if not isinstance(height_field, HeightField):
         raise RequestError(f"height_field: got {type(height_field).__name__}, wanted a HeightField")
-    angles = numbers("angles", angles, "degrees above −90 and below 90", -90.0, 90.0)
-    wavelengths = numbers("wavelengths", wavelengths, "nm from 10 to 100000 (100 µm)", 9.999, 100_000.001)
+    angles = checked_numbers("angles", angles, "degrees above −90 and below 90", -90.0, 90.0)
+    wavelengths = checked_numbers("wavelengths", wavelengths, "nm from 10 to 100000 (100 µm)", 9.999, 100_000.001)
     if theory not in THEORIES:
         raise RequestError(f"theory: got {theory!r}, wanted one of {', '.join(THEORIES)}")
     if not is_number(azimuth) or not np.isfinite(azimuth):
@@ -332,7 +332,7 @@ def _rigorous(height_field: HeightField, azimuth: float, shortest: float, transm
     return solve
 
 
-def numbers(name: str, values: ArrayLike, wanted: str, low: float, high: float) -> Array:
+def checked_numbers(name: str, values: ArrayLike, wanted: str, low: float, high: float) -> Array:
     """Return one number or several, all above `low` and below `high`, as (n,)."""
     try:
         array = np.atleast_1d(np.asarray(values, np.float64))

@@ -22,20 +22,20 @@ SHADOWING = ("v_cavity", "none")
 # Coefficients of a least-squares fit to (g(x) − 1)/t², t = 1 − x/4.
 HORIZON_GAIN = (-0.04034151, 0.81494507, -5.03522703, 10.57318562, -9.23048089, 3.5662365)
 
-Array = Any
+AnyArray = Any
 """A NumPy or Dr.Jit array, whichever `select` works on."""
 
 
 def k_g(
-    k_iz: Array,
-    k_oz: Array,
-    tangent_square: Array,
-    excess: Array = 0.0,
-    reflects: Array = True,
+    k_iz: AnyArray,
+    k_oz: AnyArray,
+    tangent_square: AnyArray,
+    excess: AnyArray = 0.0,
+    reflects: AnyArray = True,
     shadowing: bool = True,
-    min_v_z: Array = 0.0,
+    min_v_z: AnyArray = 0.0,
     select: Callable[..., Any] = np.where,
-) -> Array:
+) -> AnyArray:
     """Return K G at given k_iz, k_oz and |v_∥|; shapes broadcast, float32 is preserved.
 
     With A_i = |k_i·v|/|k_iz| and A_o = |k_o·v|/|k_oz|, K = A_i A_o/v_z². For reflected light G is the shadowing of
@@ -116,7 +116,7 @@ def diffracted(
     return Diffracted(kept, tangent_o[kept], k_oz, v_z, factor, np.minimum(cos_half, 1))
 
 
-def horizon_gain(x: Array, select: Callable[..., Any] = np.where) -> Array:
+def horizon_gain(x: AnyArray, select: Callable[..., Any] = np.where) -> AnyArray:
     """Return g(x), which compensates the power of a Gaussian lobe below the horizon; x ≥ 0 in standard deviations.
 
     Of lobes centred at x and cut off at 0, g(x) g(y) φ(x − y) is symmetric and integrates to one:

@@ -26,13 +26,13 @@ from .errors import RequestError
 from .progress import stage
 from .scalar_theory import Waves
 from .settings import REPRESENTATIONS, Settings
-from .spectrum.exr import doubles, one_line, read, write
+from .spectrum.exr import doubles, one_line, read_channels, write_channels
 from .spectrum.grids import OrderGrid, SplineGrid
 from .spectrum.power_spectrum import PowerSpectrum
 from .spectrum.tables import AmplitudeTable, SliceTable
 
-FORMAT = "mitsuba_diffraction grating spectrum"
-FORMAT_VERSION = 10
+SCALAR_FORMAT = "mitsuba_diffraction grating spectrum"
+SCALAR_FORMAT_VERSION = 10
 
 # Attributes and their names in files.
 _NUMBERS = {
@@ -114,7 +114,7 @@ class GratingSpectrum(PowerSpectrum):
             header |= {"heightScale": doubles(table.height), "heightsFrom": self.settings.heights_from}
         channels = _channels(table)
         header["channelCount"] = len(channels)
-        write(path, FORMAT, FORMAT_VERSION, header, channels, recipe)
+        write_channels(path, SCALAR_FORMAT, SCALAR_FORMAT_VERSION, header, channels, recipe)
 
     @classmethod
     def load(cls, path: str | os.PathLike[str], recipe: str | None = None) -> GratingSpectrum:
@@ -126,7 +126,7 @@ class GratingSpectrum(PowerSpectrum):
                 representation, or was not built from that recipe.
         """
         path = Path(path)
-        header, channels = read(path, FORMAT, FORMAT_VERSION, recipe)
+        header, channels = read_channels(path, SCALAR_FORMAT, SCALAR_FORMAT_VERSION, recipe)
         if (got := header.get("representation")) not in REPRESENTATIONS[1:]:
             raise RequestError(f"{path}: got representation {got!r}, wanted one of {', '.join(REPRESENTATIONS[1:])}")
         try:

@@ -2,8 +2,8 @@
 
 Dr.Jit loads libLLVM once, when it is imported: the library in ``DRJIT_LIBLLVM_PATH``, or else the newest of the system.
 That may be missing or too old, without an error: with LLVM 15 and 16 the first kernel with ``dr.maximum`` or
-``dr.clip`` aborts the process. :func:`choose` therefore selects the library of the wheel ``karellen-llvm-core`` unless
-the variable already points to a suitable one; it must run before Dr.Jit is imported.
+``dr.clip`` aborts the process. :func:`choose_libllvm` therefore selects the library of the wheel
+``karellen-llvm-core`` unless the variable already points to a suitable one; it must run before Dr.Jit is imported.
 """
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ _WHEEL = "karellen-llvm-core"
 _RUNTIME_LIBRARIES = ("libunwind.so.1", "libc++abi.so.1", "libc++.so.1")
 
 
-def choose() -> None:
+def choose_libllvm() -> None:
     """Point ``DRJIT_LIBLLVM_PATH`` to the wheel's library unless it names a suitable one. Call before Dr.Jit loads."""
     given = os.environ.get(_PATH_VARIABLE)
     if given and _library_version(given) >= MINIMUM_VERSION:

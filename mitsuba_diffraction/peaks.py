@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from scipy.ndimage import gaussian_filter
 
-from .efficiency import OrderEfficiencies, description, index_at, numbers
+from .efficiency import OrderEfficiencies, checked_numbers, description, index_at
 from .errors import RequestError
 from .geometry import fresnel
 from .progress import Progress, silent
@@ -123,10 +123,10 @@ def check_request(
     """
     low, high = valid
     wanted = f"nm from {low:g} to {high:g}, for which the spectrum is valid"
-    wavelengths = numbers("wavelengths", wavelengths, wanted, low - 1e-3, high + 1e-3)
+    wavelengths = checked_numbers("wavelengths", wavelengths, wanted, low - 1e-3, high + 1e-3)
     for wavelength in wavelengths:
         index_at(wavelength * 1e-3, material, 1.5 if material is None and int_ior is None else int_ior)
-    return numbers("angles", angles, "degrees above −90 and below 90", -90.0, 90.0), wavelengths
+    return checked_numbers("angles", angles, "degrees above −90 and below 90", -90.0, 90.0), wavelengths
 
 
 def _reflected(spectrum: PowerSpectrum, direction: Array, wavelength: float) -> tuple[Array, Array]:

@@ -26,11 +26,11 @@ from .llvm import is_supported
 PLUGINS = (
     ("diffraction_grating", "register_bsdf", "bsdf.diffraction_grating"),
     ("diffraction_path", "register_integrator", "integrator.diffraction_path"),
-    ("diffraction_shader", "register_integrator", "evaluation.realtime_shader.integrator"),
+    ("diffraction_shader", "register_integrator", "evaluation.realtime_shader.diffraction_shader"),
 )
 
 
-def register(variant: str) -> None:
+def register_plugins(variant: str) -> None:
     """Register the plugins for `variant`, or stand-ins that raise the reason why they cannot work."""
     for name, function, module in PLUGINS:
         define = importlib.import_module(f".{module}", __package__).define
@@ -133,4 +133,4 @@ if not getattr(mi, "_mitsuba_diffraction_registered", False):
     if dr.thread_count() < 2:
         dr.set_thread_count(2)
 if mi.variant() is not None:
-    register(mi.variant())
+    register_plugins(mi.variant())

@@ -12,10 +12,10 @@ from .errors import RequestError
 from .files import cache_folder
 from .grating_spectrum import GratingSpectrum
 from .progress import Progress, silent
-from .rigorous import build as rigorous
-from .rigorous.efficiencies import one_thread
-from .rigorous.spectrum import FORMAT as RIGOROUS_FORMAT
-from .rigorous.spectrum import RigorousSpectrum
+from .rigorous import build_table as rigorous
+from .rigorous.rigorous_spectrum import RIGOROUS_FORMAT as RIGOROUS_FORMAT
+from .rigorous.rigorous_spectrum import RigorousSpectrum
+from .rigorous.solver import one_thread
 from .settings import SERIES, SUN_COHERENCE_LENGTH, VISIBLE, Settings
 from .spectrum import build as scalar
 from .surface.heightfield import HeightField
@@ -115,12 +115,12 @@ def build_spectrum(patches: Sequence[HeightField], settings: Settings, progress:
         )
     if settings.theory == "scalar":
         with one_thread():
-            return GratingSpectrum(**vars(scalar.build_spectrum(patches, settings, progress)))
+            return GratingSpectrum(**vars(scalar.build_power_spectrum(patches, settings, progress)))
     if len(patches) > 1:
         raise RequestError(
             f"theory: got rigorous and {len(patches)} patches ({first.source}, …), wanted one, of one row"
         )
-    return rigorous.build_spectrum(first, settings, progress, cache_folder())
+    return rigorous.build_rigorous(first, settings, progress, cache_folder())
 
 
 def load_spectrum(path: str | os.PathLike[str], recipe: str | None = None) -> Spectrum:

@@ -48,11 +48,11 @@ from typing import Any
 
 from .errors import RequestError, check_whole
 from .files import cache_folder, refuse_special
-from .grating_spectrum import FORMAT_VERSION, GratingSpectrum
+from .grating_spectrum import SCALAR_FORMAT_VERSION, GratingSpectrum
 from .materials import is_file
 from .precomputation import Spectrum, build_spectrum, load_spectrum
 from .progress import Progress, no_progress, part, silent, stage
-from .rigorous import build as rigorous
+from .rigorous import build_table as rigorous
 from .scalar_theory import scalar_waves
 from .settings import Settings
 from .surface.gratings import COHERENCE_LENGTHS, PATCHES, PROFILES
@@ -72,7 +72,7 @@ _OF_PROFILE = "coherence_length", "largest_height_range", *REQUESTED
 MAX_PATCHES = 1000  # of which the mean has three per cent of the speckle of one patch
 # Incremented when the same input gives a different result, to invalidate the cache.
 _BUILD_VERSION = 10
-# Spectra in the package (precompute/ready_spectra.py), named as in the cache.
+# Spectra in the package (tools/data/ready_spectra.py), named as in the cache.
 READY_SPECTRA = Path(__file__).parent / "data" / "spectra"
 _HEIGHTS_TIME_FRACTION = 0.3  # of the build, spent on the heights of several patches, roughly
 # Mitsuba constructs plugins in parallel; only one of those with the same recipe may compute its spectrum.
@@ -256,7 +256,7 @@ class Recipe:
 
     def digest(self) -> str:
         """Return the SHA-256 of everything that determines the spectrum: the recipe and the contents of the scan."""
-        versions = [FORMAT_VERSION, _BUILD_VERSION]
+        versions = [SCALAR_FORMAT_VERSION, _BUILD_VERSION]
         if self.settings.theory == "rigorous":
             versions.append(rigorous.BUILD_VERSION)
         content = hashlib.sha256(".".join(map(str, versions)).encode())

@@ -36,7 +36,7 @@ def _on_variant_change(old: str | None, new: str | None) -> None:
     from . import plugin
 
     if loaded:
-        plugin.register(new)
+        plugin.register_plugins(new)
 
 
 class _MitsubaFinder(importlib.abc.MetaPathFinder):
@@ -51,7 +51,7 @@ class _MitsubaFinder(importlib.abc.MetaPathFinder):
         if name in ("drjit", "mitsuba") and "drjit" not in sys.modules:
             from . import llvm
 
-            llvm.choose()
+            llvm.choose_libllvm()
         if name != "mitsuba" or self._searching:
             return None
         self._searching = True

@@ -2,7 +2,7 @@
 
 Scalar theory treats each facet of the surface as a plane mirror (tangent-plane approximation), which holds if the
 surface varies slowly on the scale of a wavelength. A stored map quantifies its error over period/λ and depth/λ, by the
-solver of `rigorous` (`precompute/scalar_theory_map.py`).
+solver of `rigorous` (`tools/data/scalar_theory_map.py`).
 """
 
 from __future__ import annotations
@@ -24,8 +24,8 @@ from .errors import RequestError
 from .geometry import Diffracted, diffracted, fresnel
 from .reference import amplitudes
 from .rigorous.coordinate_transformation import curve_of, is_profile
-from .rigorous.efficiencies import converge
-from .rigorous.spectrum import MAX_PERIOD_IN_WAVELENGTHS
+from .rigorous.rigorous_spectrum import MAX_PERIOD_IN_WAVELENGTHS
+from .rigorous.solver import converge
 from .settings import VISIBLE
 from .spectrum.grids import OrderGrid
 from .surface.heightfield import HeightField
@@ -39,8 +39,8 @@ MAP = Path(__file__).parent / "data" / "scalar_error.json"
 
 # Conditions under which the error of a surface is reported; the map is the same for ±20°.
 INDEX = 1.5
-ANGLES = (0.0, 20.0, -20.0)  # of incidence, degrees
-WAVELENGTHS = (0.45, 0.55, 0.65)  # µm, of visible light
+ERROR_ANGLES = (0.0, 20.0, -20.0)  # of incidence, degrees
+ERROR_WAVELENGTHS = (0.45, 0.55, 0.65)  # µm, of visible light
 _PARTS = (1 / 6, 1 / 2, 5 / 6)  # of another range of wavelengths: the middles of its thirds
 _MIN_POWER = 1e-9  # of a wave, as a fraction of all
 _WAVES_PER_OCTAVE = 16  # of period, into which the waves of a surface are sorted
@@ -219,7 +219,7 @@ def _lattice(pitch: Array, cutoff: float) -> tuple[NDArray[np.int64], Array]:
     return m if len(pitch) == 2 else m[:, 0], steps
 
 
-def difference(scalar: ArrayLike, rigorous: ArrayLike) -> float:
+def efficiency_difference(scalar: ArrayLike, rigorous: ArrayLike) -> float:
     """Return the L1 difference of efficiencies relative to the rigorously reflected power: Σ|Δη_m| / Σ η_m."""
     scalar, rigorous = np.asarray(scalar), np.asarray(rigorous)
     return float(np.abs(scalar - rigorous).sum() / rigorous.sum())
@@ -227,7 +227,7 @@ def difference(scalar: ArrayLike, rigorous: ArrayLike) -> float:
 
 @functools.cache
 def error_map(material: str = "dielectric") -> tuple[Array, Array, Array, Array]:
-    """Return the error of scalar theory for sinusoids in unpolarised light (`precompute/scalar_theory_map.py`).
+    """Return the error of scalar theory for sinusoids in unpolarised light (`tools/data/scalar_theory_map.py`).
 
     Args:
         material: "dielectric", n = 1.5, or "Al", aluminium at 550 nm; "transmitted" and "transmitted from below": the
@@ -300,7 +300,7 @@ def expected_error(
 
 @dataclass(frozen=True)
 class ScalarError:
-    """The error of scalar theory for one surface: the mean over `ANGLES` and some wavelengths, for n = 1.5.
+    """The error of scalar theory for one surface: the mean over `ERROR_ANGLES` and some wavelengths, for n = 1.5.
 
     Attributes:
         share: Σ|Δη_m| as a fraction of the reflected power; infinite outside the stored map (depths above 2 λ).
@@ -333,7 +333,7 @@ class ScalarError:
             return f"error unknown, the surface is deeper than two wavelengths ({light})"
         about = "about " if self.estimated else ""
         reflected, transmitted = (f"{float(f'{100 * error:.2g}'):g}%" for error in (self.share, self.transmitted))
-        conditions = f"mean over {light} and 0–{max(ANGLES):g}°, n = {INDEX:g}"
+        conditions = f"mean over {light} and 0–{max(ERROR_ANGLES):g}°, n = {INDEX:g}"
         return f"errs by {about}{reflected} of the reflected light, {transmitted} of the transmitted ({conditions})"
 
 
@@ -373,7 +373,7 @@ class Waves:
         The map is averaged over the waves, each weighted by its fraction of the variance, at the depth of the sinusoid
         of equal roughness. Periods outside the map take the value at its boundary.
         """
-        wavelengths = wavelengths_of(light)
+        wavelengths = error_wavelengths(light)
         if self.solved is not None and self.solved.wavelengths == wavelengths and index == 1:
             return self.solved
         inside = [wavelength / index for wavelength in wavelengths]
@@ -415,17 +415,17 @@ class Waves:
         return cls(**content, solved=solved)
 
 
-def wavelengths_of(light: tuple[float, float]) -> tuple[float, ...]:
+def error_wavelengths(light: tuple[float, float]) -> tuple[float, ...]:
     """Return the wavelengths in µm at which the error is determined for light of (shortest, longest) ones in nm."""
     first, last = light
     if (first, last) == VISIBLE:
-        return WAVELENGTHS
+        return ERROR_WAVELENGTHS
     return tuple(sorted({1e-3 * (first + (last - first) * part) for part in _PARTS}))
 
 
 def scalar_waves(height_field: HeightField, extent: str = "tile", light: tuple[float, float] = VISIBLE) -> Waves:
     """Determine the waves of a surface, and solve profiles to which rigorous theory applies for the light in nm."""
-    waves, wavelengths = Waves.of(height_field, extent), wavelengths_of(light)
+    waves, wavelengths = Waves.of(height_field, extent), error_wavelengths(light)
     if waves.width is None or waves.width > MAX_PERIOD_IN_WAVELENGTHS * light[0] * 1e-3:
         return waves
     # Deeper profiles take long to solve, and are far outside the range.
@@ -457,7 +457,7 @@ def _solved_error(profile: HeightField, wavelengths: Sequence[float]) -> tuple[f
     powers, curve = profile_powers(row), curve_of(row)
     errors = []
     for wavelength in wavelengths:
-        for angle in ANGLES:
+        for angle in ERROR_ANGLES:
             omega_i = np.array([-np.sin(np.deg2rad(angle)), 0.0, np.cos(np.deg2rad(angle))])
             exact = converge(curve, omega_i, period / wavelength, INDEX, _MAX_SOLVER_ERROR)
             if not exact.error <= _MAX_SOLVER_ERROR:
@@ -468,7 +468,7 @@ def _solved_error(profile: HeightField, wavelengths: Sequence[float]) -> tuple[f
             # Only one of the theories may include an order exactly at the horizon, which has no power.
             errors.append(
                 [
-                    difference(found.unpolarised[np.isin(found.m, m)], eta[np.isin(m, found.m)])
+                    efficiency_difference(found.unpolarised[np.isin(found.m, m)], eta[np.isin(m, found.m)])
                     for found, (m, eta) in zip((scalar, scalar_transmitted), wanted, strict=True)
                 ]
             )

@@ -19,15 +19,13 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import partial
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
+from .geometry import AnyArray
 from .materials import NOMINAL_WAVELENGTH, RefractiveIndex
 
-Array = Any
-"""A NumPy or Dr.Jit array."""
 Real = NDArray[np.float64]
 Plane = Callable[[Real], tuple[Real, Real]]
 """R and T of unpolarised light at the cosines of the angles of incidence."""
@@ -37,7 +35,7 @@ MAX_PHASE_STEP = 1.0  # radians between states of a stack whose thickness varies
 MAX_STATES = 9
 
 
-def crossed(field: tuple[Array, Array], y: Array, u: Array, v: Array) -> tuple[Array, Array]:
+def across_film(field: tuple[AnyArray, AnyArray], y: AnyArray, u: AnyArray, v: AnyArray) -> tuple[AnyArray, AnyArray]:
     """Return (B, C) at the outer face of a film from (B, C) at its inner face.
 
     Args:
@@ -49,7 +47,7 @@ def crossed(field: tuple[Array, Array], y: Array, u: Array, v: Array) -> tuple[A
     return u * b + v / y * c, v * y * b + u * c
 
 
-def reflected_and_incident(field: tuple[Array, Array], y_0: Array) -> tuple[Array, Array]:
+def reflected_and_incident(field: tuple[AnyArray, AnyArray], y_0: AnyArray) -> tuple[AnyArray, AnyArray]:
     """Return y_0 B − C and y_0 B + C."""
     b, c = field
     return y_0 * b - c, y_0 * b + c
@@ -75,7 +73,7 @@ def powers(
         z = _root(n**2 + square)
         factor = np.exp(2j * np.pi * depth * z)
         u, v = (1 + factor**2) / 2, (1 - factor**2) / 2
-        fields = [crossed(field, y, u, v) for field, y in zip(fields, (z, z / n**2), strict=True)]
+        fields = [across_film(field, y, u, v) for field, y in zip(fields, (z, z / n**2), strict=True)]
         across = across * factor
     reflected, transmitted = [], []
     for field, y_0, gain in zip(fields, (z_0, z_0 / outside**2), (1, outside / below), strict=True):

@@ -7,7 +7,7 @@ import mitsuba as mi
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from .bsdf.tables import aligned
+from .bsdf.device_tables import aligned
 from .errors import RequestError
 from .llvm import is_supported
 

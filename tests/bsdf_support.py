@@ -11,8 +11,8 @@ import pytest
 
 import mitsuba_diffraction as md
 from mitsuba_diffraction import testing
-from mitsuba_diffraction.rigorous.build import build_spectrum
-from mitsuba_diffraction.rigorous.spectrum import Axes, RigorousSpectrum
+from mitsuba_diffraction.rigorous.build_table import build_rigorous
+from mitsuba_diffraction.rigorous.rigorous_spectrum import Axes, RigorousSpectrum
 from mitsuba_diffraction.settings import Settings
 
 array, direction, floats, vectors = testing.array, testing.direction, testing.floats, testing.vectors
@@ -69,9 +69,9 @@ def coarse_glass(transmission):
     )
     with pytest.MonkeyPatch.context() as patch, warnings.catch_warnings():
         warnings.simplefilter("ignore")
-        patch.setattr("mitsuba_diffraction.rigorous.build._SOLVED_STEPS_TRANSMISSION", ((3, 4, 3),))
-        patch.setattr("mitsuba_diffraction.rigorous.build._CHECK_COUNT", 40)
-        return build_spectrum(md.gratings.blazed(0.3, 0.05, samples=64), settings)
+        patch.setattr("mitsuba_diffraction.rigorous.build_table._SOLVED_STEPS_TRANSMISSION", ((3, 4, 3),))
+        patch.setattr("mitsuba_diffraction.rigorous.build_table._CHECK_COUNT", 40)
+        return build_rigorous(md.gratings.blazed(0.3, 0.05, samples=64), settings)
 
 
 def use(variant):

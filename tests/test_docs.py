@@ -4,6 +4,7 @@ import importlib
 import importlib.util
 import inspect
 import logging
+import pkgutil
 import re
 import shlex
 import shutil
@@ -38,7 +39,7 @@ SHOWN = {"text", "bash"}
 BY_OTHER_MEANS = (
     *("python3 -m venv", "python -m pytest", "pip install", "jupyter ", "mkdocs "),
     *("mitsuba-diffraction benchmark", "mitsuba-diffraction convergence", "mitsuba-diffraction validate"),
-    *("python precompute/rigorous_reference.py", "python scenes/", "python docs/"),
+    *("python tools/", "python scenes/"),
 )
 """Commands that CI runs, and the tests of notebooks, the manual, the benchmark, the validation and the gallery."""
 NUMBER = re.compile(r"(?<![\w.])[-−]?\d+(?:\.\d*)?(?:e[-+]?\d+)?")
@@ -177,7 +178,7 @@ def test_a_wrong_block_of_code_is_found(folder, command, llvm, capfd):
 
 def test_the_manual_lists_the_parameters_of_the_plugins(llvm):
     from mitsuba_diffraction.bsdf import diffraction_grating
-    from mitsuba_diffraction.evaluation.realtime_shader import integrator
+    from mitsuba_diffraction.evaluation.realtime_shader import diffraction_shader
     from mitsuba_diffraction.integrator import diffraction_path
 
     text, listed, head = (ROOT / "docs" / "plugin.md").read_text().replace("`", ""), set(), []
@@ -190,7 +191,7 @@ def test_the_manual_lists_the_parameters_of_the_plugins(llvm):
         elif cells and head:
             row = dict(zip(head, cells, strict=False))
             listed.add((row["parameter"], row["type"], row.get("default", "").strip("| ")))
-    known = (*diffraction_grating.PARAMETERS, *integrator.PARAMETERS, *diffraction_path.PARAMETERS)
+    known = (*diffraction_grating.PARAMETERS, *diffraction_shader.PARAMETERS, *diffraction_path.PARAMETERS)
     assert listed == {(parameter.name, parameter.type, parameter.default) for parameter in known}
 
 
@@ -202,22 +203,14 @@ def test_the_manual_lists_what_rigorous_theory_refuses():
     assert set(re.findall(r"`(\w+)`", sentence)) == set(_SCALAR_ONLY)
 
 
-def named_by(path):
-    """The object of a dotted name; a function before the module that defines it."""
-    found = md
-    for part in path.split(".")[1:]:
-        found = getattr(found, part, None) or importlib.import_module(f"{found.__name__}.{part}")
-    return found
-
-
 def test_the_page_on_python_names_the_public_interface():
     page = (ROOT / "docs" / "python.md").read_text().replace("`md.", "`mitsuba_diffraction.")
     named = set(re.findall(r"mitsuba_diffraction\.[\w.]+\w", page))
     assert len(named) > 15
     for name in named:
-        named_by(name)
+        pkgutil.resolve_name(name)
     for summary in re.findall(r"^\| `(mitsuba_diffraction\.[\w.]+)\((.*?)\)`", page, re.MULTILINE):
-        parameters = inspect.signature(named_by(summary[0])).parameters
+        parameters = inspect.signature(pkgutil.resolve_name(summary[0])).parameters
         for argument in summary[1].split(", "):
             assert argument.split("=")[0] == "…" or argument.split("=")[0] in parameters, summary
 
@@ -225,7 +218,7 @@ def test_the_page_on_python_names_the_public_interface():
 def test_the_reference_has_all_public_names():
     page = (ROOT / "docs" / "reference.md").read_text()
     named = re.findall(r"^::: (mitsuba_diffraction\.[\w.]+)$", page, re.MULTILINE)
-    objects = [named_by(name) for name in named]
+    objects = [pkgutil.resolve_name(name) for name in named]
     for name in md.__all__:
         found = getattr(md, name)
         inside = [

@@ -1,18 +1,15 @@
-"""The table of docs/figures.py: all figures of the manual, by commands that exist."""
+"""The table of tools/manual/figures.py: all figures of the manual, by commands that exist."""
 
 import re
-import sys
 from pathlib import Path
 
+import contact_sheet
+import figures
 import nbformat
 import pytest
 
 ROOT = Path(__file__).parents[1]
 DOCS = ROOT / "docs"
-sys.path[:0] = [str(DOCS), str(ROOT / "precompute")]
-
-import contact_sheet  # noqa: E402
-import figures  # noqa: E402
 
 TABLE = list(figures.figures())
 

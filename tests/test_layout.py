@@ -1,6 +1,7 @@
 """Imports run one way, and nothing offline imports Mitsuba or Dr.Jit."""
 
 import ast
+import collections
 import functools
 import graphlib
 import json
@@ -58,6 +59,59 @@ def _imports(module):
                 found = f"{source}.{alias.name}" if f"{source}.{alias.name}" in MODULES else source
                 if found in MODULES:
                     yield found
+
+
+FIXED = {"CHECKS", "MANUAL", "PARAMETERS", "define", "efficiencies", "main"}
+"""Names that several modules have: of checks and of plugins, by which they are found; `md.efficiencies` and
+`md.rigorous.efficiencies`; the entry points of the process and of the command line."""
+
+
+def names_of(module):
+    """The public names that a module defines at its top level."""
+    for node in ast.parse(MODULES[module].read_text(encoding="utf-8")).body:
+        if isinstance(node, ast.FunctionDef | ast.ClassDef):
+            yield node.name
+        elif isinstance(node, ast.Assign | ast.AnnAssign) and not is_array_type(node.value):
+            targets = node.targets if isinstance(node, ast.Assign) else [node.target]
+            yield from (name.id for target in targets for name in ast.walk(target) if isinstance(name, ast.Name))
+
+
+def is_array_type(value):
+    """Whether a value is a type of arrays, for which several modules may have the same short name."""
+    return value is not None and ast.unparse(value).startswith("NDArray[")
+
+
+def is_command(module, name):
+    return module.endswith(f".{name}") and (".cli." in module or ".commands." in module)
+
+
+def repeated(pairs):
+    """The names of several modules, except commands and the function that each calls."""
+    found = collections.defaultdict(set)
+    for name, module in pairs:
+        if not name.startswith("_") and not is_command(module, name):
+            found[name].add(module)
+    return {name: sorted(modules) for name, modules in found.items() if len(modules) > 1}
+
+
+@pytest.mark.quick
+def test_a_name_stands_for_one_thing():
+    found = repeated((name, module) for module in MODULES for name in names_of(module))
+    assert not {name: modules for name, modules in found.items() if name not in FIXED}
+    assert found.keys() == FIXED
+
+
+@pytest.mark.quick
+def test_a_module_has_its_file_name_for_itself():
+    modules = MODULES.keys() - {"mitsuba_diffraction"}
+    assert not repeated((module.rpartition(".")[2], module) for module in modules)
+    for module in modules:
+        package, _, name = module.rpartition(".")
+        nodes = ast.walk(ast.parse(MODULES[package].read_text(encoding="utf-8")))
+        found = [
+            alias.name for node in nodes if isinstance(node, ast.ImportFrom) and node.module for alias in node.names
+        ]
+        assert name not in found or is_command(module, name), module
 
 
 def in_a_fresh_process(program):
@@ -167,7 +221,7 @@ def test_plugins_are_registered_whenever_the_package_is_imported(lines):
 
 
 REPOSITORY = PACKAGE.parent
-SCRIPTS = sorted(path for folder in ("docs", "precompute", "scenes") for path in (REPOSITORY / folder).rglob("*.py"))
+SCRIPTS = sorted(path for folder in ("tools", "scenes") for path in (REPOSITORY / folder).rglob("*.py"))
 PAGES = [REPOSITORY / "README.md", *sorted((REPOSITORY / "docs").rglob("*.md")), *REPOSITORY.glob("notebooks/*.ipynb")]
 
 

@@ -1,10 +1,10 @@
 """The spectra that the package brings are those that their recipes give, and scenes take them."""
 
-import sys
 from pathlib import Path
 
 import numpy as np
 import pytest
+import ready_spectra
 
 from mitsuba_diffraction.energy.table import EnergyTable
 from mitsuba_diffraction.precomputation import load_spectrum
@@ -12,9 +12,6 @@ from mitsuba_diffraction.recipe import READY_SPECTRA, Recipe
 from mitsuba_diffraction.render.scene import load_spectral_scene
 
 ROOT = Path(__file__).parents[1]
-sys.path.insert(0, str(ROOT / "precompute"))
-
-import ready_spectra  # noqa: E402
 
 
 @pytest.mark.parametrize(

@@ -17,8 +17,8 @@ import mitsuba as mi
 
 from ..errors import RequestError
 from ..materials import RefractiveIndex
+from .device_tables import opaque
 from .indices import Dispersion, absolute_index, index_from
-from .tables import opaque
 
 SAME_INDEX = 1e-3  # indices of refraction that differ by less, as for air and vacuum, are taken as equal
 

@@ -11,9 +11,9 @@ from ..grating_spectrum import GratingSpectrum
 from ..spectrum.grids import SplineGrid, spline_weights
 from ..spectrum.tables import SliceTable
 from .continuum_sampler import BinSampler
-from .geometry import Geometry, Incidence
+from .device_tables import larger, opaque
+from .directions import Geometry, Incidence
 from .orders import SlicePower
-from .tables import larger, opaque
 
 RIM = 3  # nodes of zero around the table, as many as a spline covers
 

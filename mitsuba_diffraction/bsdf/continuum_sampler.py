@@ -18,11 +18,11 @@ from scipy.special import ndtr
 
 from ..grating_spectrum import GratingSpectrum
 from ..spectrum.grids import OrderGrid, spline_integral
-from .geometry import Incidence
-from .inversion import KAPPA_BINS, KappaBins, choose, cumulative_sums, mean_powers, search
-from .tables import PacketTable, ProbabilityTable, larger, opaque
+from .device_tables import PacketTable, ProbabilityTable, larger, opaque
+from .directions import Incidence
+from .inversion import KAPPA_BINS, KappaBins, choose_bin, cumulative_sums, mean_powers, search
 
-MAX_BIN_WIDTH = 2.0  # in σ_q
+MAX_SAMPLER_BIN_WIDTH = 2.0  # in σ_q
 MAX_BIN_SPACING = 0.06  # cycles/µm, where lobes are wide
 BLOCK = 4  # columns of bins; tables of the sums of all columns would be slow to search
 MAX_LINE_WIDTH = 0.25  # standard deviation of q across lines and ridges, relative to that along the axis
@@ -54,7 +54,7 @@ class BinAxis:
             half_width = min(spectrum.lobes[axis].half_width, LOBE_CUTOFF * sigma)
         else:
             node_spacing, half_width = grid.spacing[axis], 1.5 * grid.spacing[axis]
-        spacing = node_spacing / np.ceil(node_spacing / min(MAX_BIN_WIDTH * sigma, MAX_BIN_SPACING))
+        spacing = node_spacing / np.ceil(node_spacing / min(MAX_SAMPLER_BIN_WIDTH * sigma, MAX_BIN_SPACING))
         max_index = int(np.ceil((nodes[-1] + half_width) / spacing - 0.5))
         ends = (np.arange(-max_index, max_index + 2) - 0.5) * spacing
         if isinstance(grid, OrderGrid):
@@ -133,7 +133,7 @@ class BinSampler:
         position in the row.
         """
         centre = self._axes(-incidence.tangent * incidence.frequency)
-        kappa_bin, u = choose(self.kappa_bins.weights(incidence), u)
+        kappa_bin, u = choose_bin(self.kappa_bins.weights(incidence), u)
 
         def cumulative(table: PacketTable, index: mi.Int32) -> mi.Float:
             return table.component(mi.UInt32(index), kappa_bin, active)
@@ -142,7 +142,7 @@ class BinSampler:
         row, _ = search(lambda i: cumulative(self.cumulative_rows, i), *rows, self.rows, u)
         start = row * (self.blocks + 1)
         block, x = search(lambda i: cumulative(self.cumulative_blocks, start + i), *blocks, self.blocks, v.x)
-        column, x = choose(self.powers.block(mi.UInt32(row * self.blocks + block), kappa_bin, active), x)
+        column, x = choose_bin(self.powers.block(mi.UInt32(row * self.blocks + block), kappa_bin, active), x)
         bins = mi.Point2f(BLOCK * block + mi.Int32(column) - self.max_index[0], row - self.max_index[1])
         q = mi.Point2f((bins.x + x - 0.5) * self.spacing[0], (bins.y + v.y - 0.5) * self.spacing[1])
         inverse, ratio = _inverted(q, centre, incidence.radius)

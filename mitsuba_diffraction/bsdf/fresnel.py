@@ -13,8 +13,8 @@ from ..materials import MAX_INDEX, MIN_INDEX, RefractiveIndex, constant, index_o
 from ..stack import Stack
 from .base import nested_plugin
 from .coat import Coat
+from .device_tables import opaque
 from .indices import Dispersion, absolute_index, index_from, nodes_of
-from .tables import opaque
 
 
 class Material:

@@ -12,11 +12,11 @@ import numpy as np
 from ..errors import RequestError
 from ..progress import progress_bar
 from ..recipe import Recipe
-from .energy import Coordinates
-from .geometry import Geometry, Incidence, Interface, rotated
+from .device_tables import BELOW_ONE, larger, limited, opaque, smaller
+from .directions import Geometry, Incidence, Interface, rotated
+from .energy_factor import Coordinates
 from .parameters import GratingRequest
 from .polarisation import reflected, through_layer
-from .tables import BELOW_ONE, larger, limited, opaque, smaller
 from .theory import theory_of
 from .varying import check_texture
 

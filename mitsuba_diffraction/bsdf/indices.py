@@ -19,9 +19,9 @@ from ..materials import (
 )
 from ..settings import VISIBLE
 from .base import nested_plugin
-from .tables import PacketTable, integer_part, limited, opaque
+from .device_tables import PacketTable, integer_part, limited, opaque
 
-MAX_NODES = 4000
+MAX_INDEX_NODES = 4000
 
 
 def index_from(name: str, index: float | str, absorbing: bool = False) -> RefractiveIndex:
@@ -103,4 +103,4 @@ def nodes_of(index: RefractiveIndex) -> np.ndarray:
     """Return equidistant wavelengths of a table and visible light, at most 1 nm apart unless there are too many, nm."""
     first, last = index.range
     first, last = (min(VISIBLE[0], np.ceil(first)), max(VISIBLE[1], np.floor(last))) if first else VISIBLE
-    return np.linspace(first, last, min(round(last - first), MAX_NODES) + 1)
+    return np.linspace(first, last, min(round(last - first), MAX_INDEX_NODES) + 1)

@@ -22,8 +22,8 @@ from numpy.typing import NDArray
 
 from ..energy.table import Layout
 from ..grating_spectrum import GratingSpectrum
-from .geometry import Incidence, cell_of, on_square
-from .tables import BELOW_ONE, larger, limited, opaque
+from .device_tables import BELOW_ONE, larger, limited, opaque
+from .directions import Incidence, cell_of, on_square
 
 KAPPA_BINS = 4  # the components of a packet
 
@@ -61,7 +61,7 @@ def mean_powers(spectrum: GratingSpectrum, kappa_bins: KappaBins) -> NDArray[np.
     return np.stack(means)
 
 
-def choose(weights: mi.Vector4f, u: mi.Float) -> tuple[mi.UInt32, mi.Float]:
+def choose_bin(weights: mi.Vector4f, u: mi.Float) -> tuple[mi.UInt32, mi.Float]:
     """Choose a bin with probability proportional to its weight.
 
     Returns:

@@ -8,11 +8,11 @@ import drjit as dr
 import mitsuba as mi
 
 from .base import base_from
-from .geometry import Interface, rotated
+from .device_tables import BELOW_ONE, smaller
+from .directions import Interface, rotated
 from .grating import Grating
 from .parameters import GratingRequest
 from .polarisation import of_facets, reflected
-from .tables import BELOW_ONE, smaller
 
 MIN_LAYER_PROBABILITY = 0.1  # of sampling the grating, and its base, as their powers are only estimated
 

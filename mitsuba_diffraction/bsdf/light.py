@@ -14,7 +14,7 @@ from .base import gratings_in, parts
 STEP = 0.25  # nm, less than the width of a lamp's lines
 
 
-def wavelengths_of(film: mi.Film) -> tuple[float, float]:
+def recorded_wavelengths(film: mi.Film) -> tuple[float, float]:
     """Return (shortest, longest) wavelength that a film records, nm; a film without a response records visible light.
 
     Raises:
@@ -47,7 +47,7 @@ def cover_light(scene: mi.Scene, sensor: mi.Sensor | int | None = None) -> None:
         sensors = [sensor] if isinstance(sensor, mi.Sensor) else sensors[sensor : sensor + 1]
     if not gratings or not sensors:
         return
-    ranges = [wavelengths_of(one.film()) for one in sensors]
+    ranges = [recorded_wavelengths(one.film()) for one in sensors]
     first, last = min(low for low, _ in ranges), max(high for _, high in ranges)
     for bsdf in gratings.values():
         shortest, longest = first, last

@@ -26,9 +26,9 @@ from ..geometry import fresnel
 from ..grating_spectrum import GratingSpectrum
 from ..spectrum.grids import OrderGrid
 from ..stack import Stack
-from .geometry import Incidence, cell_of
+from .device_tables import NumberTable, PacketTable, integer_part, larger, opaque
+from .directions import Incidence, cell_of
 from .inversion import direction_bin, direction_borders, search
-from .tables import NumberTable, PacketTable, integer_part, larger, opaque
 
 PROBABILITY_UNITS = 2**24  # to the probability one; float32 represents integers exactly up to it
 UNIFORM_FRACTION = 0.05  # of the probability in a bin, divided equally among its orders
@@ -39,7 +39,7 @@ MAX_ENTRIES, MAX_INTERFACE_ENTRIES = 1e5, 2.5e5
 # Radians, by which the phase of the deepest point in normal reflection from above may change within a bin (of line
 # gratings, which have few orders; of other gratings), and between the points of a bin at which powers are evaluated.
 MAX_LINE_PHASE, MAX_PHASE, MAX_POINT_PHASE = 2.0, 4.0, 2.5
-MIN_SLICES, MAX_SLICES = 4, 10  # bins of 1/λ
+MIN_WAVELENGTH_BINS, MAX_WAVELENGTH_BINS = 4, 10  # bins of 1/λ
 MIN_SIDE_BINS, MAX_SIDE_BINS = 4, 96  # along a side of the square of directions
 FRACTION_SIDE_BINS = 64  # likewise, of the transmitted fraction
 MAX_INDEX_CHANGE = 0.01  # of η, relative to η − 1, up to which a table is reused
@@ -83,7 +83,7 @@ class OrderSampler:
         sides = (True, False) if self.transmits else (True,)
         phase = 4 * np.pi * spectrum.height_range * float(np.mean(height_scales)) * (last - first)
         max_phase = MAX_LINE_PHASE if 0 in grid.max_order else MAX_PHASE
-        self.slices = int(np.clip(phase * coat_index / max_phase, MIN_SLICES, MAX_SLICES))
+        self.slices = int(np.clip(phase * coat_index / max_phase, MIN_WAVELENGTH_BINS, MAX_WAVELENGTH_BINS))
         orders = np.minimum((1 + self.eta) * self.tile * (first + last) / 2, 2 * self.max_order) + 1
         ranges = list(itertools.pairwise(height_scales)) or [(height_scales[0], height_scales[0])]
         entries = MAX_INTERFACE_ENTRIES if self.transmits and not is_sheet else MAX_ENTRIES

@@ -16,10 +16,10 @@ from ..grating_spectrum import GratingSpectrum
 from ..spectrum.grids import LobeAxis, OrderGrid
 from ..spectrum.tables import HALF_SCALE, AmplitudeTable, SliceTable, shared_exponents
 from .continuum_sampler import BinSampler
-from .geometry import Geometry, Incidence
+from .device_tables import PacketTable, SharedExponentTable, integer_part, larger, opaque
+from .directions import Geometry, Incidence
 from .inversion import truncated_gaussian
 from .order_sampler import OrderSampler
-from .tables import PacketTable, SharedExponentTable, integer_part, larger, opaque
 
 # Nodes are stored in squares of 4 × 4, so that a window of nodes of one word lies in one to four cache lines.
 _SQUARE_SIDE = 4

@@ -17,14 +17,14 @@ from ..geometry import SHADOWING
 from ..materials import RefractiveIndex, is_file
 from ..precomputation import Spectrum, load_spectrum
 from ..recipe import REQUESTED, Recipe
-from ..rigorous.spectrum import RigorousSpectrum
+from ..rigorous.rigorous_spectrum import RigorousSpectrum
 from ..settings import FROM_RADIUS, MIN_WAVELENGTH, THEORIES, TRANSMISSIONS, VISIBLE, wavelengths_inside
 from ..surface.gratings import PROFILES
 from .base import nested_plugin
 from .coat import SAME_INDEX, Coat, coat_from
+from .device_tables import larger
 from .fresnel import Conductor, Material, PerfectMirror, SpectralConductor, reflectance_from
 from .indices import absolute_index, index_from
-from .tables import larger
 from .thin_film import with_film
 from .varying import VaryingNumber, check_texture, numbers_from
 

@@ -13,12 +13,12 @@ import mitsuba as mi
 import numpy as np
 from numpy.typing import NDArray
 
-from ..rigorous.efficiencies import ODD, REVERSED
-from ..rigorous.spectrum import RigorousSpectrum
-from .geometry import Geometry, Incidence, WaveVector, cell_of
+from ..rigorous.rigorous_spectrum import RigorousSpectrum
+from ..rigorous.solver import ODD, REVERSED
+from .device_tables import NumberTable, PacketTable, integer_part, larger, limited, opaque, smaller
+from .directions import Geometry, Incidence, WaveVector, cell_of
 from .inversion import search, truncated_gaussian
 from .order_sampler import PROBABILITY_UNITS, cumulative_units
-from .tables import NumberTable, PacketTable, integer_part, larger, limited, opaque, smaller
 
 BINS_PER_UNIT = 8  # of the sampler, along p and r
 TRANSMISSION_BINS_PER_UNIT = 4  # likewise, where light is transmitted

@@ -13,18 +13,18 @@ import numpy as np
 from ..energy.table import EnergyTable
 from ..grating_spectrum import GratingSpectrum
 from ..precomputation import Spectrum
-from ..rigorous.spectrum import RigorousSpectrum
+from ..rigorous.rigorous_spectrum import RigorousSpectrum
 from ..settings import VISIBLE
 from ..spectrum.grids import OrderGrid
 from ..stack import Stack
 from .continuum import SplineSpectrum
-from .energy import Energy
+from .energy_factor import Energy
 from .order_sampler import OrderSampler
 from .orders import OrderSpectrum
 from .parameters import Scales
 from .rigorous_orders import RigorousOrders
 
-MAX_PHASE_STEP = 0.5  # radians at the deepest point, between nodes of the ratio of scales in a table of E
+MAX_NODE_PHASE_STEP = 0.5  # radians at the deepest point, between nodes of the ratio of scales in a table of E
 MAX_RATIOS = 16  # number of these nodes
 SAMPLER_RATIOS = 7  # number of ratios of varying scales; `OrderSampler` has bins for each interval between two
 
@@ -94,7 +94,7 @@ class SharedTables:
         E is linear between nodes of the ratio of scales where that varies or has a gradient.
         """
         spectrum, (low, high) = cast(GratingSpectrum, self._spectrum), scales.ratios()
-        per_step = spectrum.max_kappa * spectrum.height_range / MAX_PHASE_STEP
+        per_step = spectrum.max_kappa * spectrum.height_range / MAX_NODE_PHASE_STEP
         if low == high and not scales.height.varies and dr.grad_enabled(scales.height.value):
             # Wide enough for differences of values that are stored as bytes.
             half = 1 / max(per_step, 10)

@@ -17,19 +17,19 @@ from ..errors import RequestError
 from ..geometry import SHADOWING
 from ..grating_spectrum import GratingSpectrum
 from ..precomputation import Spectrum
-from ..rigorous.spectrum import RigorousSpectrum
+from ..rigorous.rigorous_spectrum import RigorousSpectrum
 from ..settings import VISIBLE
 from ..stack import Stack
 from .coat import SAME_INDEX, Coat
-from .energy import Coordinates, Energy
+from .device_tables import opaque
+from .directions import Geometry, Incidence, Interface, rotated
+from .energy_factor import Coordinates, Energy
 from .fresnel import Material
-from .geometry import Geometry, Incidence, Interface, rotated
 from .order_sampler import MAX_INDEX_CHANGE, OrderSampler
 from .parameters import GratingRequest, Media, check_parameters, check_transmission
 from .polarisation import Split, of_facets, of_orders
 from .rigorous_orders import RigorousOrders
 from .shared import SharedTables
-from .tables import opaque
 
 MAX_FILM_CHANGE = 5e-4  # µm, of a film, up to which a table is reused
 _log = logging.getLogger(__name__)

@@ -17,9 +17,9 @@ import numpy as np
 from .. import stack
 from ..errors import RequestError
 from ..materials import RefractiveIndex
+from .device_tables import PacketTable, integer_part, larger, limited, opaque
 from .fresnel import Material, PerfectMirror
-from .indices import MAX_NODES, Dispersion, index_from, nodes_of
-from .tables import PacketTable, integer_part, larger, limited, opaque
+from .indices import MAX_INDEX_NODES, Dispersion, index_from, nodes_of
 from .varying import VaryingNumber
 
 MAX_THICKNESS = 4.0  # µm in all: the fringes of thicker films are narrow in λ
@@ -113,7 +113,7 @@ def _crossed(
         factor = dr.exp(-delta.imag) * mi.Complex2f(cos, sin)
         twice = factor * factor
         u, v, across = 0.5 * (1 + twice), 0.5 * (1 - twice), across * factor
-    return [stack.crossed(field, y, u, v) for field, y in zip(fields, (z, z / (n * n)), strict=True)], across
+    return [stack.across_film(field, y, u, v) for field, y in zip(fields, (z, z / (n * n)), strict=True)], across
 
 
 def with_film(props: mi.Properties, material: Material) -> Material:
@@ -132,7 +132,7 @@ def with_film(props: mi.Properties, material: Material) -> Material:
     if isinstance(material, PerfectMirror):
         raise RequestError("thin_film_thickness: got a film on material=none, wanted a dielectric or a conductor")
     iors, thicknesses = props["thin_film_ior"], props["thin_film_thickness"]
-    indices = listed("thin_film_ior", iors) if isinstance(iors, str) else [iors]
+    indices = list_entries("thin_film_ior", iors) if isinstance(iors, str) else [iors]
     media = [index_from("thin_film_ior", _number_or_name(ior), absorbing=True) for ior in indices]
     scale = VaryingNumber(props, "thin_film_scale", 1.0)
     if len(media) == 1 and not (isinstance(thicknesses, str) and _is_list(thicknesses)):
@@ -143,7 +143,7 @@ def with_film(props: mi.Properties, material: Material) -> Material:
             f"thin_film_thickness: got {given_as} for {len(media)} films, wanted a list of as many numbers; "
             "thin_film_scale is a number or texture by which they are multiplied"
         )
-    numbers = [_number_or_name(text) for text in listed("thin_film_thickness", thicknesses)]
+    numbers = [_number_or_name(text) for text in list_entries("thin_film_thickness", thicknesses)]
     if any(isinstance(number, str) for number in numbers):
         raise RequestError(f"thin_film_thickness: got {thicknesses!r}, wanted numbers of µm")
     if len(numbers) != len(media):
@@ -167,7 +167,7 @@ def _number_or_name(ior: float | str) -> float | str:
     return ior
 
 
-def listed(name: str, text: str) -> list[str]:
+def list_entries(name: str, text: str) -> list[str]:
     """Return the entries of a list such as "2.35, 1.38", or with repetitions, "8 x (2.35, 1.38), 2.35".
 
     Raises:
@@ -346,7 +346,7 @@ class StackedMaterial(_Filmed):
             if not film.is_constant:
                 own = nodes_of(film)
                 first, last = min(first, own[0]), max(last, own[-1])
-        grid = np.linspace(first, last, min(round(last - first), MAX_NODES) + 1)
+        grid = np.linspace(first, last, min(round(last - first), MAX_INDEX_NODES) + 1)
         values = np.stack([film(grid * 1e-3) for film in films]) / self.outside
         self.table, self.nodes = PacketTable(np.stack([values.real, values.imag], -1), width=2), opaque(len(grid))
         self.first, self.per_nanometre = opaque(grid[0]), opaque((len(grid) - 1) / (grid[-1] - grid[0]))

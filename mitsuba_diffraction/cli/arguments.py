@@ -80,7 +80,7 @@ def is_scan(source: str) -> bool:
     return is_file and source not in PROFILES and path.suffix.lower() not in (".toml", ".exr")
 
 
-def numbers(option: str, text: str) -> NDArray[np.float64]:
+def parse_numbers(option: str, text: str) -> NDArray[np.float64]:
     """Return the numbers in "30", "0,30,60" or "0:60:5" (60 included), (n,), at most 10,000."""
     try:
         if ":" not in text:
@@ -95,8 +95,8 @@ def numbers(option: str, text: str) -> NDArray[np.float64]:
 
 
 def angles_of(option: str, text: str) -> NDArray[np.float64]:
-    """Return angles from the normal in degrees, (n,), given as `numbers`."""
-    found = numbers(option, text)
+    """Return angles from the normal in degrees, (n,), given as in `parse_numbers`."""
+    found = parse_numbers(option, text)
     if (wrong := found[~(np.abs(found) < 90)]).size:
         raise RequestError(f"{option}: got {wrong[0]:g}, wanted degrees above −90 and below 90")
     return found

@@ -14,12 +14,12 @@ from ..errors import RequestError
 from ..files import refuse_special
 from ..inverse_design import Design, Verdict, makers
 from ..inverse_design import design as search
-from ..inverse_design.build import WHITE
 from ..inverse_design.output import SUFFIXES, save
 from ..inverse_design.plate import for_detail
+from ..inverse_design.search import WHITE
 from ..outputs import check_outputs, free_name
 from ..progress import progress_bar, say, show, table, tell
-from .arguments import Overwrite, check_suffix, converted, numbers
+from .arguments import Overwrite, check_suffix, converted, parse_numbers
 from .render import Stopped
 
 _MIN_SAID_TIME = 90.0  # s, that a search takes
@@ -82,7 +82,7 @@ def design(
         raise RequestError(f"{target}: got {'white' if invert else 'black'} alone, wanted light somewhere{help_}")
     if not invert and _is_dark_on_light(picture):
         say("note", f"{target} is light up to its edges; --invert casts what is dark in it, with more contrast")
-    wavelengths = None if wavelength is None else numbers("--wavelength", wavelength).tolist()
+    wavelengths = None if wavelength is None else parse_numbers("--wavelength", wavelength).tolist()
     if detail is not None:
         if texels is not None:
             raise RequestError(f"--detail: got {detail:g} and --texels {texels}, wanted one of them")

@@ -24,8 +24,8 @@ from .arguments import (
     check_suffix,
     converted,
     is_scan,
-    numbers,
     options_of_scan,
+    parse_numbers,
     recipe_of,
     settings_of,
     surface_of,
@@ -68,7 +68,7 @@ def efficiency(
     overwrite: Overwrite = False,
 ) -> None:
     """Compute how much light goes into each order of a grating, or each spectral peak of an irregular surface."""
-    angles, wavelengths = angles_of("--angle", angle), numbers("--wavelength", wavelength)
+    angles, wavelengths = angles_of("--angle", angle), parse_numbers("--wavelength", wavelength)
     name, values = surface_of(source)
     of_scan, given = options_of_scan(context), settings_of(context)
     of_spectrum: dict[str, Any] = {key: given[key] for key in ("extent", "coherence_length") if key in given}

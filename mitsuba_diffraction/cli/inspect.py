@@ -15,7 +15,7 @@ from rich.text import Text
 from ..errors import RequestError
 from ..inspection import Inspection, save_picture
 from ..inspection import inspect as look
-from ..inspection.colours import GREEN, Colour, colours_at
+from ..inspection.predicted_colours import GREEN, Colour, colours_at
 from ..outputs import check_outputs, free_name, plain, save_json
 from ..progress import progress_bar, show, table, tell
 from ..settings import SUN_COHERENCE_LENGTH, lobe_width

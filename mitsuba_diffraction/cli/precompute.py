@@ -13,7 +13,7 @@ from ..outputs import check_outputs
 from ..precomputation import Spectrum
 from ..progress import durations, progress_bar, stage, tell
 from ..recipe import Recipe
-from ..rigorous.spectrum import RigorousSpectrum
+from ..rigorous.rigorous_spectrum import RigorousSpectrum
 from ..settings import ORIGINS, REPRESENTATIONS, SUN_COHERENCE_LENGTH, THEORIES
 from ..surface.prepare import is_seam_visible, seam_steps
 from .arguments import (

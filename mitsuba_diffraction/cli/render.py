@@ -17,7 +17,7 @@ from ..progress import durations, progress_bar, say, stage, tell
 from .arguments import Define, Overwrite, Variant, check_suffix, materials_of, scene_parameters
 
 if TYPE_CHECKING:
-    from ..color import View
+    from ..color import ViewTransform
     from ..render.passes import Estimate
     from ..render.spectral_image import SpectralImage
 
@@ -254,7 +254,7 @@ def _picture(
     resume: bool,
     stored: dict[str, Any],
     denoise: bool,
-    view: View,
+    view: ViewTransform,
     label: str,
     exposure: float | None,
     complete: str | None,

@@ -15,7 +15,7 @@ from ..outputs import check_outputs
 from ..progress import NAME, progress_bar, say, tell
 from ..recipe import Recipe
 from ..viewer.page import page, reference_picture
-from ..viewer.surface import Surface
+from ..viewer.viewed_surface import Surface
 from .arguments import (
     SCAN_OPTIONS,
     Overwrite,

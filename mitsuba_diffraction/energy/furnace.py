@@ -14,7 +14,7 @@ with the gain Γ of lobes at the horizon. a is summed over components of S, each
   with the `horizon_gain` g; m(x) → √x away from the horizon.
 - Where orders overlap, and for a sample, a bin of the frequency plane, in which S is accumulated. The part of its
   radial extent that is above the horizon determines its weight and its cosine. Near the mirror direction at grazing
-  incidence (1 − b) K G + b Γ replaces K G, as in `Geometry.continuum_factor` of `bsdf/geometry.py`.
+  incidence (1 − b) K G + b Γ replaces K G, as in `Geometry.continuum_factor` of `bsdf/directions.py`.
 
 For an interface between media, the reflected and the transmitted fraction of light from one side are
 
@@ -37,7 +37,7 @@ from numpy.polynomial.legendre import leggauss
 from numpy.typing import ArrayLike, NDArray
 from scipy.interpolate import CubicSpline
 
-from ..geometry import Array, fresnel, horizon_gain, k_g
+from ..geometry import AnyArray, fresnel, horizon_gain, k_g
 from ..spectrum.grids import OrderGrid
 from ..spectrum.power_spectrum import PowerSpectrum
 from ..stack import Plane, Stack
@@ -342,14 +342,14 @@ def small_kappas(spectrum: PowerSpectrum, index: float, lateral_scale: float = 1
 
 
 def small_kappa(
-    kappa: Array,
-    first: Array,
-    power: Array,
-    at_first: Array,
-    at_second: Array,
-    where: Array = True,
+    kappa: AnyArray,
+    first: AnyArray,
+    power: AnyArray,
+    at_first: AnyArray,
+    at_second: AnyArray,
+    where: AnyArray = True,
     select: Callable[..., Any] = np.where,
-) -> Array:
+) -> AnyArray:
     """Return c_m(κ), and κ₁²/κ² c_m(κ) where κ < κ₁ = `first`.
 
     c_m of m ≠ 0 falls as κ² towards zero, below the absolute error of the table; therefore c_m/κ² is extrapolated

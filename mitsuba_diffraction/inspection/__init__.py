@@ -1,6 +1,6 @@
 """Inspection of a surface before it is rendered: statistics, periods, predicted colours, and their uncertainty."""
 
 from .picture import save_picture
-from .report import Inspection, inspect
+from .properties import Inspection, inspect
 
 __all__ = ["Inspection", "inspect", "save_picture"]

@@ -16,8 +16,8 @@ from ..files import whole_file
 from ..outputs import METADATA
 from ..surface.heightfield import HeightField
 from ..surface.periods import hann, repeated, with_uncertainty
-from .colours import WAVELENGTHS, radiance
-from .report import Inspection, reference_plane
+from .predicted_colours import WAVELENGTHS, radiance
+from .properties import Inspection, reference_plane
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes

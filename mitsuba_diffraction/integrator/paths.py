@@ -16,12 +16,12 @@ from numpy.typing import NDArray
 from ..bsdf.base import gratings_in, is_grating, parts
 
 
-def ratio(a: mi.Float, b: mi.Float) -> mi.Float:
+def quotient(a: mi.Float, b: mi.Float) -> mi.Float:
     """Return a/b, and zero where b is zero."""
     return dr.select(b != 0, a / b, 0)
 
 
-def generator(seed: mi.UInt32 | int, key: int, index: mi.UInt32) -> mi.PCG32:
+def random_numbers(seed: mi.UInt32 | int, key: int, index: mi.UInt32) -> mi.PCG32:
     """Return random numbers of each index, independent of the numbers that samplers draw from the same seed."""
     mixed = mi.UInt32(seed) ^ key
     dr.make_opaque(mixed)
@@ -76,7 +76,7 @@ class Gratings:
 
     def pdf_direction(self, si: mi.SurfaceInteraction3f, ray: mi.Ray3f) -> mi.Float:
         """Return the density of `sample` per unit solid angle, of a point that a ray hits."""
-        return ratio(dr.square(si.t), self._choice.sum() * dr.abs(dr.dot(si.n, ray.d)))
+        return quotient(dr.square(si.t), self._choice.sum() * dr.abs(dr.dot(si.n, ray.d)))
 
 
 def implements(method: Callable[..., object], *arguments: object) -> bool:
@@ -186,7 +186,7 @@ def define_eye_paths() -> type:
                 hidden = guided & ~(on_target & (dr.abs(next_si.t - distance) < _VISIBILITY_TOLERANCE * distance))
                 bsdf_pdf = bsdf_probability * dr.select(guided, pdf, bs.pdf)
                 value = dr.select(guided, value, weight * bs.pdf)
-                mixed = dr.select(hidden, 0, value * ratio(1, bsdf_pdf + _GRATING_PROBABILITY * grating_pdf))
+                mixed = dr.select(hidden, 0, value * quotient(1, bsdf_pdf + _GRATING_PROBABILITY * grating_pdf))
                 throughput *= dr.select(to_gratings & (delta ^ True), mixed, weight / bsdf_probability)
                 active &= dr.any(throughput != 0)
                 # Emitters that are never sampled are not found by paths from the light.
@@ -201,7 +201,7 @@ def define_eye_paths() -> type:
                 survival = dr.minimum(dr.max(throughput) * dr.square(eta), 0.95)
                 roulette = depth >= self.rr_depth
                 active &= (roulette ^ True) | (sampler.next_1d(active) < survival)
-                throughput *= dr.select(roulette, ratio(1, survival), 1)
+                throughput *= dr.select(roulette, quotient(1, survival), 1)
             return result, valid, []
 
     return EyePaths
@@ -231,7 +231,7 @@ def _is_smooth_reflector(bsdf: mi.BSDF) -> mi.Bool:
 
 
 def _power_heuristic(a: mi.Float, b: mi.Float) -> mi.Float:
-    return ratio(dr.square(a), dr.square(a) + dr.square(b))
+    return quotient(dr.square(a), dr.square(a) + dr.square(b))
 
 
 # ---------------------------------------------------------------- from the light
@@ -341,7 +341,7 @@ class LightPaths:
     def _trace(self, seed: mi.UInt32 | int, first: int, count: int, scale: float, buffer: SplatBuffer) -> None:
         """Trace the paths from the number `first` on, and add their contributions to the sensor to `buffer`."""
         path = dr.arange(mi.UInt32, count) + dr.opaque(mi.UInt32, first)
-        rng = generator(seed, 0x9E3779B9, path)
+        rng = random_numbers(seed, 0x9E3779B9, path)
         ray, power, active = self._start(rng)
         power *= dr.opaque(mi.Float, scale)
         si = self.scene.ray_intersect(ray, active)
@@ -362,7 +362,7 @@ class LightPaths:
             survival = dr.minimum(dr.max(throughput), 0.95)
             active &= dr.any(throughput != 0) & (depth < self.max_depth)
             active &= (roulette ^ True) | (_next_1d(rng) < survival)
-            throughput *= dr.select(roulette, ratio(1, survival), 1)
+            throughput *= dr.select(roulette, quotient(1, survival), 1)
             si = self.scene.ray_intersect(ray, active)
             active &= si.is_valid()
 
@@ -383,7 +383,7 @@ class LightPaths:
             candidate_si = mi.SurfaceInteraction3f(ps, wavelengths)
             candidate_si.time = time
             ds, radiance = self.scene.sample_emitter_direction(candidate_si, _next_2d(rng), True)
-            radiance *= ratio(1, ps.pdf)
+            radiance *= quotient(1, ps.pdf)
             # Positive at grazing incidence, where the shading normal may still face the light.
             weight = dr.mean(radiance) * (dr.abs(dr.dot(ps.n, ds.d)) + 0.1)
             # The direction to a point of the same shape may be NaN.
@@ -430,15 +430,15 @@ class LightPaths:
         # |cos θ_j/cos θ'_j|, to the normal that reflects or refracts ω_j into ω'_j; one if the direction is unchanged.
         normal = si.wi + bs.eta * bs.wo
         deflected = dr.squared_norm(normal) > 1e-8
-        cos_ratio = dr.select(deflected, dr.abs(ratio(dr.dot(si.wi, normal), dr.dot(bs.wo, normal))), 1)
-        cos_ratio_shading = dr.abs(ratio(mi.Frame3f.cos_theta(si.wi), mi.Frame3f.cos_theta(bs.wo)))
+        cos_ratio = dr.select(deflected, dr.abs(quotient(dr.dot(si.wi, normal), dr.dot(bs.wo, normal))), 1)
+        cos_ratio_shading = dr.abs(quotient(mi.Frame3f.cos_theta(si.wi), mi.Frame3f.cos_theta(bs.wo)))
         weight *= dr.select(specular, cos_ratio, cos_ratio_shading)
         # Other BSDFs may not be reciprocal, or may perturb the normal themselves. The direction of a failed sample has
         # no meaning, and may be one in which the perturbed BSDF is not zero.
         evaluates_reverse = active & (bs.pdf > 0) & ((specular | reciprocal) ^ True)
         value = bsdf.eval(mi.BSDFContext(), _with_wi(si, bs.wo), si.wi, evaluates_reverse)
-        weight = dr.select(evaluates_reverse, value * ratio(1, bsdf.pdf(ctx, si, bs.wo, evaluates_reverse)), weight)
-        weight *= dr.abs(ratio(dr.dot(ray.d, si.n), dr.dot(si.to_world(si.wi), si.n)))
+        weight = dr.select(evaluates_reverse, value * quotient(1, bsdf.pdf(ctx, si, bs.wo, evaluates_reverse)), weight)
+        weight *= dr.abs(quotient(dr.dot(ray.d, si.n), dr.dot(si.to_world(si.wi), si.n)))
         return ray, dr.select(active, weight, 0), specular
 
     def _connect(
@@ -450,7 +450,7 @@ class LightPaths:
         active &= ds.pdf > 0
         active &= self.scene.ray_test(si.spawn_ray_to(ds.p), active) ^ True
         value = bsdf.eval(mi.BSDFContext(), _with_wi(si, si.to_local(ds.d)), si.wi, active)
-        value *= importance * dr.abs(ratio(dr.dot(ds.d, si.n), dr.dot(si.to_world(si.wi), si.n)))
+        value *= importance * dr.abs(quotient(dr.dot(ds.d, si.n), dr.dot(si.to_world(si.wi), si.n)))
         return ds.uv, value, active & dr.any(value != 0)
 
 

@@ -42,7 +42,7 @@ def save(design: Design, path: str | os.PathLike[str]) -> tuple[Path, ...]:
     save_tiff(field, plate.height_range, paths[1])
     with whole_file(paths[2]) as temporary:
         temporary.write_text(_recipe(design, paths[0].name), encoding="utf-8")
-    save_picture(design, paths[3])
+    save_design_picture(design, paths[3])
     return paths
 
 
@@ -95,7 +95,7 @@ def simple_field(field: HeightField) -> bytes:
     return header + padding + (1e-6 * field.heights).astype("<f4").tobytes()
 
 
-def save_picture(design: Design, path: str | os.PathLike[str]) -> None:
+def save_design_picture(design: Design, path: str | os.PathLike[str]) -> None:
     """Write target, predicted picture, relief and efficiency over wavelength as one PNG."""
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure

@@ -11,8 +11,8 @@ from .plate import Plate
 from .result import Design
 
 # Fraction of the light in the picture, contrast, correlation with the target: at least these, means over wavelengths.
-GOOD = (0.6, 0.6, 0.85)
-VISIBLE = (0.3, 0.3, 0.6)
+GOOD_BOUNDS = (0.6, 0.6, 0.85)
+VISIBLE_BOUNDS = (0.3, 0.3, 0.6)
 _MAX_STEP = 0.45  # of levels, in wavelengths of path difference; larger ones send light into the mirror direction
 _MIN_PATH = 0.75  # of the whole relief, in wavelengths
 _MAX_LIT = 0.6  # fraction of the frame that is light
@@ -23,7 +23,7 @@ class Verdict:
     """What a plate is worth: "good", "visible" or "bad", with its measures and, unless it is good, a remedy.
 
     Attributes:
-        grade: by `GOOD` and `VISIBLE`.
+        grade: by `GOOD_BOUNDS` and `VISIBLE_BOUNDS`.
         light, contrast, correlation: means over the wavelengths.
         remedy: which option to change, or "".
     """
@@ -41,7 +41,7 @@ class Verdict:
         grade = next(
             (
                 name
-                for name, bounds in (("good", GOOD), ("visible", VISIBLE))
+                for name, bounds in (("good", GOOD_BOUNDS), ("visible", VISIBLE_BOUNDS))
                 if all(value >= bound for value, bound in zip(measures, bounds, strict=True))
             ),
             "bad",

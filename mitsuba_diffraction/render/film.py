@@ -24,8 +24,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..errors import RequestError, root_cause
-from ..integrator.paths import LightPaths, generator, unpacked
-from .scene import channel_wavelengths, channel_weights, no_warnings, recorded_range, wavelengths_of
+from ..integrator.paths import LightPaths, random_numbers, unpacked
+from .scene import channel_wavelengths, channel_weights, no_warnings, recorded_range, recorded_wavelengths
 
 Rows = tuple[int, int]
 """The first row of a band of a picture, and the row after its last."""
@@ -71,7 +71,7 @@ def trace_pass(
         Σ_s f(c − p_s) ¼ Σ_j L_s(λ_sj) t_i(λ_sj)    in channel i,    and finally    Σ_s f(c − p_s);
 
     their ratio is radiance per nm. The sums of passes are additive. Samplers that correlate samples are rotated
-    (`rotated`), so that any pass has the expectation of independent samples.
+    (`rotated_sampler`), so that any pass has the expectation of independent samples.
 
     The result is determined, bit for bit, by the seed, the scene, the versions of Mitsuba and Dr.Jit and the type of
     processor. Integrators that need Mitsuba's film (`needs_mitsubas_film`) are not reproducible in the last bits.
@@ -170,7 +170,7 @@ def is_independent(sampler: mi.Sampler) -> bool:
     return sampler.class_name() == "IndependentSampler"
 
 
-def rotated(sampler: mi.Sampler, seed: int, pixel: mi.UInt32) -> mi.Sampler:
+def rotated_sampler(sampler: mi.Sampler, seed: int, pixel: mi.UInt32) -> mi.Sampler:
     """Return a seeded sampler whose samples are uniform in all dimensions; the same sampler if it is `independent`.
 
     In Mitsuba's stratifying samplers, pairs of dimensions are not uniform, whatever the seed: with eight samples per
@@ -190,12 +190,12 @@ def _rotated_sampler(variant: str) -> type:
     """Define the sampler for a variant, as its base class depends on the variant."""
 
     class RotatedSampler(mi.Sampler):
-        """Sampler whose numbers are shifted at random for each pixel and dimension, see `rotated`."""
+        """Sampler whose numbers are shifted at random for each pixel and dimension, see `rotated_sampler`."""
 
         def __init__(self, sampler: mi.Sampler, seed: int, pixel: mi.UInt32) -> None:
             mi.Sampler.__init__(self, mi.Properties())
             self.sampler = sampler
-            self.rng = generator(seed, 0x7F4A7C15, pixel)
+            self.rng = random_numbers(seed, 0x7F4A7C15, pixel)
 
         def next_1d(self, active: mi.Bool = True) -> mi.Float:
             return _fraction(self.sampler.next_1d(active) + self.rng.next_float32())
@@ -293,7 +293,7 @@ def _trace(
     # Opaque, so that passes of different sizes share their kernels.
     count, stride = dr.opaque(mi.UInt32, spp), dr.opaque(mi.UInt32, traced_columns)
     pixel = dr.arange(mi.UInt32, size) // count
-    sampler = rotated(sampler, seed, pixel)
+    sampler = rotated_sampler(sampler, seed, pixel)
     row = pixel // stride
     corner = mi.Vector2f(mi.Vector2i(pixel - row * stride, row) - mi.Vector2i(border, dr.opaque(mi.Int32, margins[1])))
     position = corner + sampler.next_2d()
@@ -324,7 +324,7 @@ def _on_channels(film: mi.Film, wavelengths: mi.Spectrum, value: mi.Spectrum) ->
     si.wavelengths = wavelengths
     response = film.sensor_response_function().eval(si)
     radiance = mi.unpolarized_spectrum(value) * dr.select(response > 0, dr.rcp(response), 0)
-    centres = channel_wavelengths(wavelengths_of(film))
+    centres = channel_wavelengths(recorded_wavelengths(film))
     step = float(centres[1] - centres[0])
     return list((wavelengths - float(centres[0])) / step), list(radiance / (len(radiance) * step))
 
@@ -357,7 +357,7 @@ def _sums_of_light(
     def range_of_pixel(index: mi.UInt32, active: mi.Bool) -> tuple[mi.UInt32, mi.UInt32]:
         return dr.gather(mi.UInt32, starts, index, active), dr.gather(mi.UInt32, starts, index + 1, active)
 
-    channels = channel_wavelengths(wavelengths_of(film)).size
+    channels = channel_wavelengths(recorded_wavelengths(film)).size
     sums = collect(film.rfilter(), position, channel, value, size, margins, range_of_pixel, channels)
     # The contributions are not needed any more when the samples are traced.
     dr.eval(sums)

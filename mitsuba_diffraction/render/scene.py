@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 
 from ..bsdf.base import gratings_in, is_grating
 from ..bsdf.diffraction_grating import check
-from ..bsdf.light import cover_light, wavelengths_of
+from ..bsdf.light import cover_light, recorded_wavelengths
 from ..errors import RequestError, root_cause
 from ..files import refuse_other_than_utf8
 from ..llvm import is_supported
@@ -78,7 +78,7 @@ def channel_weights(spectral_range: SpectralRange = VISIBLE) -> NDArray[np.float
 
 def recorded_range(scene: mi.Scene) -> SpectralRange:
     """Return the range of the first sensor of a scene from `load_spectral_scene`."""
-    shortest, longest = wavelengths_of(scene.sensors()[0].film())
+    shortest, longest = recorded_wavelengths(scene.sensors()[0].film())
     return round(shortest, 6), round(longest, 6)
 
 
@@ -248,7 +248,7 @@ def _draw_wavelengths_of_lights(scene: mi.Scene) -> None:
         distribution = mi.traverse(sensor.film().sensor_response_function())
         response = np.array(distribution["values"], np.float64)
         response /= response.sum()
-        grid = np.linspace(*wavelengths_of(sensor.film()), response.size)
+        grid = np.linspace(*recorded_wavelengths(sensor.film()), response.size)
         lines = np.zeros_like(response)
         for emitter in scene.emitters():
             recorded = response * _emission(emitter, grid)

@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..color import (
-    View,
+    ViewTransform,
     XYZ_to_linear_sRGB,
     auto_exposure,
     into_gamut,
@@ -267,7 +267,7 @@ def save_preview(
     path: str | os.PathLike[str],
     exposure: float | None = None,
     denoise: Callable[[NDArray[np.float32]], NDArray[np.float32]] | None = None,
-    view: View = neutral_view,
+    view: ViewTransform = neutral_view,
 ) -> float:
     """Write an 8-bit sRGB preview of a spectral image, in the format given by the suffix of `path`: PNG or JPEG.
 

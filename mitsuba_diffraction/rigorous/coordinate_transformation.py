@@ -146,7 +146,7 @@ def _graded(edges: Real, length: float) -> Real:
     return np.concatenate(at)
 
 
-class Grating:
+class CurveMatrices:
     """Matrices common to all eigenproblems of a curve. Lengths are in units of period / 2π.
 
     Attributes:
@@ -239,7 +239,7 @@ class HalfSpace:
     source: Complex
 
 
-def half_space(grating: Grating, alpha_0: float, gamma2: complex, upwards: bool) -> HalfSpace:
+def half_space(grating: CurveMatrices, alpha_0: float, gamma2: complex, upwards: bool) -> HalfSpace:
     """Compute the fields with ∇²ψ + γ²ψ = 0 above a curve, or below it.
 
     Args:

@@ -47,7 +47,7 @@ _MAX_TABLE_BYTES = 4e9
 Splines = SamplePowers | TileSplines
 
 
-def build_spectrum(patches: Sequence[HeightField], settings: Settings, progress: Progress) -> PowerSpectrum:
+def build_power_spectrum(patches: Sequence[HeightField], settings: Settings, progress: Progress) -> PowerSpectrum:
     """Compute the mean power spectrum of the phase e^{iκh} of patches of one size; raises and warns as `precompute`."""
     height_field = patches[0]
     height_range = max(patch.height_range for patch in patches)

@@ -44,7 +44,7 @@ def doubles(*values: float) -> np.ndarray:
     return np.array(values, np.float64)
 
 
-def write(
+def write_channels(
     path: str | os.PathLike[str],
     kind: str,
     version: int,
@@ -84,7 +84,7 @@ def refuse_incomplete(path: Path) -> None:
             raise OSError(errno.EIO, "only a part could be written; the disk may be full") from None
 
 
-def read(path: Path, kind: str, version: int, recipe: str | None) -> tuple[dict[str, Any], dict[str, Any]]:
+def read_channels(path: Path, kind: str, version: int, recipe: str | None) -> tuple[dict[str, Any], dict[str, Any]]:
     """Read header and channels of a file that `write` wrote."""
     if not path.is_file():
         raise FileNotFoundError(f"{path}: no such file")

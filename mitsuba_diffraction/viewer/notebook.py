@@ -11,7 +11,7 @@ from ..errors import RequestError
 from ..grating_spectrum import GratingSpectrum
 from ..recipe import Recipe
 from .page import page
-from .surface import Surface, material_from
+from .viewed_surface import Surface, material_from
 
 
 class View:

@@ -23,9 +23,9 @@ from ..spectrum.tables import HALF_SCALE, SliceTable
 from ..surface.heightfield import HeightField
 from .arrays import encoded
 from .coil import coil
-from .surface import AIR, DISCS, Surface
+from .viewed_surface import AIR, DISCS, Surface
 
-MAX_BYTES = 6_000_000  # of a page of one surface
+MAX_PAGE_BYTES = 6_000_000  # of a page of one surface
 MAX_HEIGHTS_SIDE = 512  # pixels of the heights for the shader of 2014
 
 SHORTEST_SHOWN = 380.0  # nm, of the wavelengths that a page shows
@@ -57,7 +57,7 @@ def page(surface: Surface, *others: Surface, picture: NDArray[np.float16] | None
         picture: linear sRGB for comparison with the first, (height, width, 3), the lowest row first.
 
     Raises:
-        RequestError: if the page of one surface would be larger than `MAX_BYTES`, or two surfaces have one name.
+        RequestError: if the page of one surface would be larger than `MAX_PAGE_BYTES`, or two surfaces have one name.
     """
     text = (_ASSETS / "page.html").read_text(encoding="utf-8")
     shaders = {path.stem: path.read_text(encoding="utf-8") for path in sorted(_ASSETS.glob("*.glsl"))}
@@ -75,9 +75,9 @@ def page(surface: Surface, *others: Surface, picture: NDArray[np.float16] | None
     data = []
     for index, one in enumerate((surface, *others)):
         data.append(_json(_data(one, picture if index == 0 else None)))
-        if (size := around + len(data[-1].encode())) > MAX_BYTES:
+        if (size := around + len(data[-1].encode())) > MAX_PAGE_BYTES:
             raise RequestError(
-                f"{one.name}: got a page of {size / 1e6:.3g} MB, wanted at most {MAX_BYTES / 1e6:g}; a larger "
+                f"{one.name}: got a page of {size / 1e6:.3g} MB, wanted at most {MAX_PAGE_BYTES / 1e6:g}; a larger "
                 "tolerance or a shorter coherence length makes its table smaller"
             )
     tags = (f'<script id="data{i or ""}" type="application/json">{one}</script>' for i, one in enumerate(data))

@@ -18,7 +18,7 @@ from bsdf_support import (
 from scipy.special import erf
 
 import mitsuba_diffraction as md
-from mitsuba_diffraction.rigorous.spectrum import Axes, RigorousSpectrum
+from mitsuba_diffraction.rigorous.rigorous_spectrum import Axes, RigorousSpectrum
 
 PERIOD, ETA, WAVELENGTH = 0.3, 1.5, 0.45
 WAVELENGTHS = (405.0, 440.0, 470.0, 498.0)

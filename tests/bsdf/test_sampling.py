@@ -23,7 +23,7 @@ from bsdf_support import (
 import mitsuba_diffraction as md
 from mitsuba_diffraction import testing
 from mitsuba_diffraction.bsdf.continuum_sampler import BinSampler
-from mitsuba_diffraction.bsdf.geometry import Incidence, Interface
+from mitsuba_diffraction.bsdf.directions import Incidence, Interface
 from mitsuba_diffraction.bsdf.order_sampler import OrderSampler
 
 SKINS = "elaphe", "xenopeltis"  # slow to build

@@ -12,7 +12,7 @@ from bsdf_support import check_chi_square, direction, interaction, random_direct
 
 import mitsuba_diffraction as md
 from mitsuba_diffraction import testing
-from mitsuba_diffraction.bsdf.geometry import Geometry, Incidence, Interface
+from mitsuba_diffraction.bsdf.directions import Geometry, Incidence, Interface
 from mitsuba_diffraction.bsdf.order_sampler import OrderSampler
 from mitsuba_diffraction.materials import constant
 from mitsuba_diffraction.stack import Stack

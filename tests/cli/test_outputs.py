@@ -369,7 +369,7 @@ def picture():
 
 
 WRITERS = {
-    "table.exr": lambda path: exr.write(path, "table", 1, {}, {"a": noise(4, 4)}, ""),
+    "table.exr": lambda path: exr.write_channels(path, "table", 1, {}, {"a": noise(4, 4)}, ""),
     "picture.exr": lambda path: picture().save(path),
     **{f"preview{suffix}": lambda path: save_preview(picture(), path) for suffix in (".png", ".jpg", ".tif", ".webp")},
     "turn.webp": lambda path: save_animation(["frame.png"] * 2, path),

@@ -14,7 +14,7 @@ from theories import COLUMNS, compare_theories
 import mitsuba_diffraction as md
 from mitsuba_diffraction import gratings
 from mitsuba_diffraction.evaluation import report
-from mitsuba_diffraction.evaluation.benchmark import benchmark
+from mitsuba_diffraction.evaluation.benchmark import study
 from mitsuba_diffraction.evaluation.benchmark.accuracy import Exact
 from mitsuba_diffraction.evaluation.benchmark.cases import Case, bundled_cases, scan_case
 from mitsuba_diffraction.evaluation.benchmark.measured import measured_bsdf
@@ -61,7 +61,7 @@ def test_the_material_of_measured_reflects_and_is_sampled(llvm):
 def test_a_run_reports_every_combination(llvm, tmp_path):
     deep = Case("deep", gratings.sinusoidal(2.5, 2.0), "tile", 65.0)
     steps = []
-    results, shaders = benchmark.run(
+    results, shaders = study.run_benchmark(
         [BLAZE, deep],
         tolerances=(1e-2,),
         count=1 << 12,
@@ -77,7 +77,7 @@ def test_a_run_reports_every_combination(llvm, tmp_path):
         assert min(result.beside_measured) > 0
         assert result.accuracy.l1 <= 1e-2
     console = Console(width=200, record=True)
-    console.print(*benchmark.tables(results, shaders, []))
+    console.print(*study.benchmark_tables(results, shaders, []))
     text = console.export_text()
     assert "flss, as published" in text
 
@@ -87,7 +87,7 @@ def test_a_run_reports_every_combination(llvm, tmp_path):
     # Without its quirks the shader shows this model's colours, but for its 5 nm steps and the patches' 10 nm.
     assert corrected.delta_e[0] < published.delta_e[0]
     assert corrected.delta_e[0] < 1
-    benchmark.save_plot(results, tmp_path / "plot.png")
+    study.save_speed_plot(results, tmp_path / "plot.png")
     with Image.open(tmp_path / "plot.png") as picture:
         assert picture.width > 600
         assert np.ptp(np.asarray(picture)) > 100
@@ -102,7 +102,7 @@ def test_sampling_is_measured(llvm):
     assert found.variance_ratio > 1
     assert found.picture_ratio > 0
     console = Console(width=200, record=True)
-    console.print(*benchmark.tables([], [], [found]))
+    console.print(*study.benchmark_tables([], [], [found]))
     assert "blaze" in console.export_text()
 
 

@@ -99,7 +99,7 @@ def test_tiles_are_three_synthetic_and_two_measured_skins():
 @pytest.mark.slow
 def test_a_run_measures_errors_and_costs(llvm, tmp_path):
     steps = []
-    found = terms.run(
+    found = terms.measure_terms(
         [SINUSOID], ["sinusoid"], lambda *step: steps.append(step), count=1 << 10, shading_points=1 << 4, repetitions=1
     )
     assert steps == [(0, 1), (1, 1)]
@@ -122,9 +122,9 @@ def test_a_run_measures_errors_and_costs(llvm, tmp_path):
     assert terms.affordable_transforms(fft, 1 << 20) == pytest.approx(2**22 / fft.time_ratio)
 
     console = Console(width=200, record=True)
-    console.print(*terms.tables(found))
+    console.print(*terms.terms_tables(found))
     assert "flss, as published" in console.export_text()
-    save_png(terms.plot(found), tmp_path / "plot.png")
+    save_png(terms.plot_terms(found), tmp_path / "plot.png")
     with Image.open(tmp_path / "plot.png") as picture:
         assert picture.width > 300
         assert np.ptp(np.asarray(picture)) > 100

@@ -24,11 +24,11 @@ from numpy.typing import NDArray
 
 from mitsuba_diffraction.evaluation.record import Record
 from mitsuba_diffraction.evaluation.validation.analytic import compare_orders
-from mitsuba_diffraction.evaluation.validation.lobes import density, grating, spectrum_of, towards
+from mitsuba_diffraction.evaluation.validation.lobes import density, grating, spectrum_of
 from mitsuba_diffraction.grating_spectrum import GratingSpectrum
 from mitsuba_diffraction.settings import lobe_width
 from mitsuba_diffraction.surface.heightfield import HeightField
-from mitsuba_diffraction.testing import direction
+from mitsuba_diffraction.testing import direction, towards
 
 Array = NDArray[np.float64]
 
@@ -84,7 +84,7 @@ def _spectrum() -> GratingSpectrum:
 def _measured_density(q: Array, wavelength: float) -> tuple[Array, NDArray[np.complex128]]:
     """Return S from the BSDF at normal incidence, and c at the same κ."""
     wi = direction(0)
-    wo = towards(wi, q, wavelength)
+    wo = towards(wi, q, 1e3 * wavelength)
     kappa = 2 * np.pi * (1 + wo[..., 2]) / wavelength
     return density(grating(_spectrum(), conserve=False), wi, wo, wavelength), _contrast(kappa)
 

@@ -9,7 +9,7 @@ from PIL import Image
 from test_comparison import GRATING, SUN, write
 
 import mitsuba_diffraction  # noqa: F401 (settles which LLVM is used before a variant is set)
-from mitsuba_diffraction.evaluation.comparison.convergence import Convergence, Point, convergence, save_plot
+from mitsuba_diffraction.evaluation.comparison.convergence import Convergence, Point, convergence, save_convergence_plot
 
 WITH_TOLERANCE = GRATING.format(profile="blazed", period=2.0, coherence=3.0, base="").replace(
     "</bsdf>", '<float name="tolerance" value="$tolerance"/></bsdf>'
@@ -45,7 +45,7 @@ def test_the_path_tracer_overtakes_at_the_interpolated_time():
 
 def test_any_number_of_tolerances_is_plotted(tmp_path):
     points = [point(f"tolerance {0.1 * 2**-k:g}", 1.0 + seconds, 9.0 - k) for k in range(6) for seconds in range(2)]
-    save_plot(Convergence("scene.xml", (8, 8), 0.0, tuple(points)), tmp_path / "plot.png")
+    save_convergence_plot(Convergence("scene.xml", (8, 8), 0.0, tuple(points)), tmp_path / "plot.png")
     with Image.open(tmp_path / "plot.png") as picture:
         assert picture.width > 1000
 

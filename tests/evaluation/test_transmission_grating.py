@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 
 from mitsuba_diffraction.evaluation.validation import transmission_grating as t300
+from mitsuba_diffraction.settings import THEORIES
 
 
 def test_b270_has_its_index_and_abbe_number():
@@ -11,7 +12,7 @@ def test_b270_has_its_index_and_abbe_number():
     assert 0.5230 / (t300.b270(0.48613) - t300.b270(0.65627)) == pytest.approx(58.5)
 
 
-@pytest.mark.parametrize("theory", t300.THEORIES)
+@pytest.mark.parametrize("theory", THEORIES)
 def test_grooves_of_glass_are_those_that_were_measured(theory):
     """The nominal angle is 17.5°."""
     angle = t300.stored_angles()["right-angled"][theory]

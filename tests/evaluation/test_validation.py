@@ -17,7 +17,7 @@ from mitsuba_diffraction.evaluation.record import Check, Record
 from mitsuba_diffraction.evaluation.validation import analytic, conservation, coupled_waves
 from mitsuba_diffraction.evaluation.validation.checks import checks, scalar_range, surface_checks
 
-PRECOMPUTE = Path(__file__).parents[2] / "precompute"
+TOOLS = Path(__file__).parents[2] / "tools" / "data"
 CHECKS = checks()
 
 
@@ -141,7 +141,7 @@ def test_the_map_is_that_of_the_solver(material):
         powers = scalar_theory.profile_powers(surface)
         scalar = scalar_theory.scalar_orders(powers, period, 1.0, angle, index, azimuth)
         np.testing.assert_array_equal(scalar.m, exact.orders)
-        found = scalar_theory.difference(scalar.unpolarised, exact.unpolarised)
+        found = scalar_theory.efficiency_difference(scalar.unpolarised, exact.unpolarised)
         assert found == pytest.approx(errors[i, j, k], rel=0.03, abs=0.003)
 
 
@@ -158,7 +158,7 @@ def test_the_map_of_transmitted_light_agrees_with_the_solver(way, period, depth,
         scalar_theory.sinusoid_powers(depth), period, 1.0, angle, 1.5, from_below=below
     )
     np.testing.assert_array_equal(found.m, exact.transmitted_orders)
-    assert scalar_theory.difference(found.unpolarised, exact.transmitted_unpolarised) == pytest.approx(
+    assert scalar_theory.efficiency_difference(found.unpolarised, exact.transmitted_unpolarised) == pytest.approx(
         stored, rel=0.03, abs=2e-3
     )
 
@@ -196,10 +196,10 @@ def test_built_in_surfaces_of_long_period_raise_no_warning():
 
 def test_error_of_a_profile_is_that_of_coupled_waves(monkeypatch):
     """The stored results of meent for a blaze of 2.5 × 0.25 µm."""
-    monkeypatch.setattr(scalar_theory, "WAVELENGTHS", (0.45, 0.65))
-    monkeypatch.setattr(scalar_theory, "ANGLES", (0.0, 20.0))
+    monkeypatch.setattr(scalar_theory, "ERROR_WAVELENGTHS", (0.45, 0.65))
+    monkeypatch.setattr(scalar_theory, "ERROR_ANGLES", (0.0, 20.0))
     stored = [
-        scalar_theory.difference(case.scalar().unpolarised, case.unpolarised)
+        scalar_theory.efficiency_difference(case.scalar().unpolarised, case.unpolarised)
         for case in coupled_waves.cases()
         if (case.profile, case.period, case.depth, case.material) == ("blazed", 2.5, 0.25, "dielectric")
         and case.angle <= 20
@@ -292,9 +292,8 @@ def test_stored_results_conserve_energy_and_are_converged():
 
 
 def solver(monkeypatch, name="coupled_waves"):
-    """A module of precompute/."""
+    """A module of tools/data/."""
     pytest.importorskip("meent", reason="the extra 'reference' is not installed")
-    monkeypatch.syspath_prepend(PRECOMPUTE)
     return importlib.import_module(name)
 
 
@@ -305,7 +304,7 @@ def test_the_script_of_the_stored_results_runs(monkeypatch, tmp_path):
     assert len(jobs) == len(coupled_waves.cases()) + len(coupled_waves.stored()["map"])
     # As it does, on the two that are quickest.
     grating = next(j for j in jobs if j.get("profile") == "sinusoidal" and (j["period"], j["depth"]) == (1.75, 0.1))
-    monkeypatch.setenv("PYTHONPATH", str(PRECOMPUTE))
+    monkeypatch.setenv("PYTHONPATH", str(TOOLS))
     maker.make(tmp_path / "made.json", [grating, next(j for j in jobs if "profile" not in j)], workers=1)
     made, stored = json.loads((tmp_path / "made.json").read_text("utf-8")), coupled_waves.stored()
     assert made.keys() == stored.keys()
@@ -322,8 +321,8 @@ def test_stored_results_are_made_again(monkeypatch):
     case = next(c for c in coupled_waves.cases() if c.profile == "blazed" and c.period == 2.5 and c.wavelength == 0.65)
     found = converged("blazed", case.period, case.depth, case.wavelength, case.angle, case.index, tolerance=3e-3)
     np.testing.assert_array_equal(found.orders, case.orders)
-    assert scalar_theory.difference(found.te, case.te) < 1e-4
-    assert scalar_theory.difference(found.tm, case.tm) < 1e-4
+    assert scalar_theory.efficiency_difference(found.te, case.te) < 1e-4
+    assert scalar_theory.efficiency_difference(found.tm, case.tm) < 1e-4
 
 
 def test_coupled_waves_send_a_blaze_to_the_side_of_its_facets(monkeypatch):
@@ -383,7 +382,7 @@ def test_a_tilt_does_not_count_as_roughness():
     waves = np.tile(0.05 * np.cos(2 * np.pi * x / 2.0), (150, 1))
     level, tilted = (scalar_range(md.HeightField(waves + slope * x, 0.08), "sample").measured for slope in (0.0, 0.1))
     assert tilted == pytest.approx(level, rel=1e-3)
-    of_wave = [scalar_theory.expected_error(2.0, 0.1, each, mean=True) for each in scalar_theory.WAVELENGTHS]
+    of_wave = [scalar_theory.expected_error(2.0, 0.1, each, mean=True) for each in scalar_theory.ERROR_WAVELENGTHS]
     assert level == pytest.approx(np.mean(of_wave), rel=0.1)  # the window broadens the wave
 
 

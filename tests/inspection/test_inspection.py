@@ -17,7 +17,8 @@ import mitsuba_diffraction as md
 from mitsuba_diffraction import testing
 from mitsuba_diffraction.color import into_gamut, spectrum_to_linear_sRGB, spectrum_to_XYZ
 from mitsuba_diffraction.inspection import inspect, picture, save_picture
-from mitsuba_diffraction.inspection.colours import (
+from mitsuba_diffraction.inspection.picture import piece_shown, with_uncertainty
+from mitsuba_diffraction.inspection.predicted_colours import (
     WAVELENGTHS,
     broadened,
     colours_at,
@@ -27,8 +28,7 @@ from mitsuba_diffraction.inspection.colours import (
     radiance,
     scanned,
 )
-from mitsuba_diffraction.inspection.picture import piece_shown, with_uncertainty
-from mitsuba_diffraction.inspection.report import concerns, statistics
+from mitsuba_diffraction.inspection.properties import concerns, statistics
 from mitsuba_diffraction.scalar_theory import scalar_error
 
 ROOT = Path(__file__).parents[2]

@@ -8,12 +8,12 @@ import pytest
 
 import mitsuba_diffraction as md
 from mitsuba_diffraction.inverse_design import Design, Verdict
-from mitsuba_diffraction.inverse_design.build import WHITE
 from mitsuba_diffraction.inverse_design.far_field import nearest_levels
 from mitsuba_diffraction.inverse_design.output import save
 from mitsuba_diffraction.inverse_design.plate import Plate
+from mitsuba_diffraction.inverse_design.search import WHITE
 from mitsuba_diffraction.inverse_design.target import wanted_fractions
-from mitsuba_diffraction.inverse_design.verdict import GOOD, VISIBLE
+from mitsuba_diffraction.inverse_design.verdict import GOOD_BOUNDS, VISIBLE_BOUNDS
 from mitsuba_diffraction.recipe import Recipe
 
 SMALL = {"texel": 1.0, "texels": 16, "starts": 6, "seen_on": "screen"}
@@ -156,7 +156,7 @@ def test_a_search_among_levels_beats_rounding(laser):
 
 def test_the_time_of_a_search_is_told_before_it(monkeypatch):
     told = []
-    monkeypatch.setattr("mitsuba_diffraction.inverse_design.build._seconds", lambda *_: 0.01)
+    monkeypatch.setattr("mitsuba_diffraction.inverse_design.search._seconds", lambda *_: 0.01)
 
     def stop(done, total):
         assert len(told) == 1
@@ -294,7 +294,7 @@ def test_a_plate_that_works_is_good(laser):
 
 def test_the_page_states_the_thresholds():
     page = (Path(__file__).parents[2] / "docs" / "design.md").read_text()
-    for name, (light, contrast, correlation) in (("good", GOOD), ("the picture can be seen, ", VISIBLE)):
+    for name, (light, contrast, correlation) in (("good", GOOD_BOUNDS), ("the picture can be seen, ", VISIBLE_BOUNDS)):
         (row,) = [line for line in page.splitlines() if line.startswith(f"| {name}")]
         assert row.endswith(f"| ≥ {light:.0%} | ≥ {contrast:g} | ≥ {correlation:g} |".replace("%", " %"))
 

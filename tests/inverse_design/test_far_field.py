@@ -7,9 +7,9 @@ import pytest
 import scipy.integrate
 import scipy.ndimage
 
-from mitsuba_diffraction.inverse_design.build import far_field_of
 from mitsuba_diffraction.inverse_design.far_field import blurred_texels, lobes_in_bins, nearest_levels
 from mitsuba_diffraction.inverse_design.plate import Plate, for_detail
+from mitsuba_diffraction.inverse_design.search import far_field_of
 from mitsuba_diffraction.inverse_design.target import wanted_fractions, with_unused
 from mitsuba_diffraction.reference import order_powers
 from mitsuba_diffraction.settings import lobe_width

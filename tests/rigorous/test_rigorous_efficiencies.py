@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from mitsuba_diffraction import HeightField, gratings, rigorous
-from mitsuba_diffraction.evaluation.validation.coupled_waves import PROFILES, cases
+from mitsuba_diffraction.evaluation.validation.coupled_waves import SOLVED_PROFILES, cases
 from mitsuba_diffraction.scalar_theory import fresnel, profile_powers, scalar_error, scalar_orders
 
 SCATMECH = json.loads((Path(__file__).parents[1] / "data" / "scatmech.json").read_text(encoding="utf-8"))
@@ -54,7 +54,7 @@ MEENT = [
 @pytest.mark.parametrize("case", MEENT, ids=lambda case: f"{case.profile}, {case.material}, {case}")
 def test_in_plane_incidence_agrees_with_meent(case):
     found = rigorous.efficiencies(
-        PROFILES[case.profile](case.period, case.depth), light(case.angle), case.wavelength, int_ior=case.index
+        SOLVED_PROFILES[case.profile](case.period, case.depth), light(case.angle), case.wavelength, int_ior=case.index
     )
     np.testing.assert_array_equal(found.orders, case.orders)
     assert difference(found.s, case.te) < 1.5e-3
@@ -290,7 +290,7 @@ def test_more_harmonics_do_not_lose_digits():
 
 
 def test_a_deep_dielectric_agrees_with_meent():
-    """s light; 22 harmonics, 128 and 256 layers, extrapolated (`precompute/coupled_waves.py`)."""
+    """s light; 22 harmonics, 128 and 256 layers, extrapolated (`tools/data/coupled_waves.py`)."""
     found = rigorous.efficiencies(gratings.sinusoidal(1.3, 1.6), light(20), 0.6, int_ior=3.0)
     np.testing.assert_array_equal(found.orders, [-1, 0, 1, 2])
     assert difference(found.s, np.array([0.0254429, 0.0295994, 0.0012986, 0.0009813])) < 3e-3

@@ -10,9 +10,9 @@ from hypothesis import strategies as st
 
 import mitsuba_diffraction as md
 from mitsuba_diffraction import gratings, rigorous
-from mitsuba_diffraction.rigorous import build
-from mitsuba_diffraction.rigorous.build import build_spectrum
-from mitsuba_diffraction.rigorous.spectrum import Axes, RigorousSpectrum, interval_bounds, interval_of
+from mitsuba_diffraction.rigorous import build_table
+from mitsuba_diffraction.rigorous.build_table import build_rigorous
+from mitsuba_diffraction.rigorous.rigorous_spectrum import Axes, RigorousSpectrum, interval_bounds, interval_of
 from mitsuba_diffraction.scalar_theory import fresnel
 from mitsuba_diffraction.settings import Settings
 
@@ -25,9 +25,9 @@ def coarse(steps, request):
     with pytest.MonkeyPatch.context() as patch, warnings.catch_warnings():
         warnings.simplefilter("ignore")
         for name in ("_SOLVED_STEPS", "_SOLVED_STEPS_TRANSMISSION"):
-            patch.setattr(build, name, (steps,))
-        patch.setattr(build, "_CHECK_COUNT", 40)
-        return build_spectrum(SURFACE, request)
+            patch.setattr(build_table, name, (steps,))
+        patch.setattr(build_table, "_CHECK_COUNT", 40)
+        return build_rigorous(SURFACE, request)
 
 
 @pytest.fixture(scope="module")
@@ -84,12 +84,12 @@ def test_light_at_grazing_incidence_is_reflected_into_order_zero(spectrum):
 )
 def test_no_efficiency_of_a_coarse_table_exceeds_one(depth, material, monkeypatch):
     """The harmonics of the table suffice for most directions, not for all."""
-    monkeypatch.setattr("mitsuba_diffraction.rigorous.build._SOLVED_STEPS", ((3, 4, 3),))
-    monkeypatch.setattr("mitsuba_diffraction.rigorous.build._CHECK_COUNT", 2)
+    monkeypatch.setattr("mitsuba_diffraction.rigorous.build_table._SOLVED_STEPS", ((3, 4, 3),))
+    monkeypatch.setattr("mitsuba_diffraction.rigorous.build_table._CHECK_COUNT", 2)
     surface = gratings.blazed(0.5, depth, samples=256)
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")
-        table = build_spectrum(surface, replace(REQUEST, **{"int_ior": None} | material, wavelengths=(400.0, 450.0)))
+        table = build_rigorous(surface, replace(REQUEST, **{"int_ior": None} | material, wavelengths=(400.0, 450.0)))
     assert table.values.min() >= 0
     assert table.values.max() <= 1
 
@@ -98,7 +98,7 @@ def test_a_profile_that_does_not_converge_is_refused():
     with pytest.raises(
         ValueError, match=r"error of 0\.\d+ with 80 harmonics at a wavelength of 400 nm, wanted at most"
     ):
-        build_spectrum(
+        build_rigorous(
             gratings.lamellar(0.3, 0.3),
             replace(REQUEST, int_ior=None, material="Ag", wavelengths=(400.0, 450.0), tolerance=1e-4),
         )
@@ -154,7 +154,7 @@ def test_energy_is_conserved_where_the_shortest_wavelength_truncates_an_interval
 
 def test_the_fit_to_a_parabola_has_the_least_mean_square_error():
     """h² f''/√720 between the ends, instead of h² f''/√120 with values of the parabola."""
-    weights = build._fitted(lambda x: build._cubic(6, x), 12)
+    weights = build_table._fitted(lambda x: build_table._cubic(6, x), 12)
     x = np.linspace(0.25, 0.75, 1201)
     found = np.interp(x, np.arange(13) / 12, weights @ (np.arange(7) / 6) ** 2)
     assert np.sqrt(np.mean((found - x**2) ** 2)) == pytest.approx(2 / 144 / np.sqrt(720), rel=0.01)
@@ -182,8 +182,8 @@ def test_transmitted_efficiencies_are_reciprocal(glass, cosine, turn, side, wave
 
 def test_matrices_of_reversed_light_agree_with_the_solver(glass, monkeypatch):
     """The table does not store light from below to above; the sheet has its own closed sum for it."""
-    monkeypatch.setattr("mitsuba_diffraction.rigorous.build._CHECK_COUNT", 30)
-    surface = build._Surface(SURFACE, replace(REQUEST, transmission=glass.transmission), 0.2)
+    monkeypatch.setattr("mitsuba_diffraction.rigorous.build_table._CHECK_COUNT", 30)
+    surface = build_table._Surface(SURFACE, replace(REQUEST, transmission=glass.transmission), 0.2)
     errors = []
     for alpha, g, wavelength, near, orders in surface.checks():
         if (1, 0) in orders and not near:
@@ -196,7 +196,7 @@ def test_matrices_of_reversed_light_agree_with_the_solver(glass, monkeypatch):
 
 def test_a_sheet_with_a_flat_grating_is_a_plate():
     """With all internal reflections T = (1 − R)/(1 + R) for each polarisation, and R + T = 1."""
-    flat = build._Surface(gratings.blazed(0.3, 0.0, samples=64), replace(REQUEST, transmission="sheet"), 0.01)
+    flat = build_table._Surface(gratings.blazed(0.3, 0.0, samples=64), replace(REQUEST, transmission="sheet"), 0.01)
     k_0, alpha, k_y = 0.3 / 0.45, 0.3, 0.35
     square = k_0**2 - k_y**2
     (solved,) = flat.solve(alpha, square, [flat.light(square, 0.45)])
@@ -212,7 +212,9 @@ def test_a_sheet_with_a_flat_grating_is_a_plate():
 @pytest.mark.parametrize("transmission", ["interface", "sheet"])
 def test_nodes_of_imaginary_k_y_continue_fresnels_formulas(transmission):
     """Where γ > ν: Fresnel's formulas in β alone, which are real there, too; likewise for a plate."""
-    flat = build._Surface(gratings.blazed(0.3, 0.0, samples=64), replace(REQUEST, transmission=transmission), 0.01)
+    flat = build_table._Surface(
+        gratings.blazed(0.3, 0.0, samples=64), replace(REQUEST, transmission=transmission), 0.01
+    )
     nu2, square, alpha = 0.4, 0.7, 0.5
     square_below = square + 1.25 * nu2
     (solved,) = flat.solve(alpha, square, [(nu2, square_below)])
@@ -258,23 +260,23 @@ def test_an_interrupted_build_resumes(tmp_path):
 
     small = gratings.sinusoidal(0.15, 0.03, samples=32)
     with pytest.raises(Enough):
-        build_spectrum(small, REQUEST, progress=stop, checkpoints=tmp_path)
+        build_rigorous(small, REQUEST, progress=stop, checkpoints=tmp_path)
     assert list(tmp_path.iterdir())
     steps = []
-    again = build_spectrum(
+    again = build_rigorous(
         small, REQUEST, progress=lambda done, total: steps.append((done, total)), checkpoints=tmp_path
     )
     assert steps[0][0] >= 5
-    np.testing.assert_array_equal(again.values, build_spectrum(small, REQUEST).values)
+    np.testing.assert_array_equal(again.values, build_rigorous(small, REQUEST).values)
     assert not list(tmp_path.iterdir())
 
 
 def test_progress_in_per_cent_begins_anew_with_a_finer_table(monkeypatch):
-    monkeypatch.setattr(build, "_SOLVED_STEPS", ((3, 3, 3), (4, 4, 4), (5, 5, 5)))
-    monkeypatch.setattr(build, "_CHECK_COUNT", 2)
+    monkeypatch.setattr(build_table, "_SOLVED_STEPS", ((3, 3, 3), (4, 4, 4), (5, 5, 5)))
+    monkeypatch.setattr(build_table, "_CHECK_COUNT", 2)
     reports = []
     with pytest.warns(UserWarning, match="with 5 steps per interval"):
-        build_spectrum(
+        build_rigorous(
             gratings.sinusoidal(0.15, 0.03, samples=32),
             replace(REQUEST, tolerance=1e-4),
             progress=lambda done, total: reports.append((done, total)),
@@ -300,12 +302,12 @@ def test_the_work_of_a_job_is_the_number_of_its_eigenproblems(transmission, monk
             solved.append(arguments)
         return fields(*arguments)
 
-    fields = build.half_space
-    monkeypatch.setattr(build, "half_space", counting)
-    monkeypatch.setattr(build._Surface.solve, "__defaults__", (0, counting))
-    monkeypatch.setattr(build, "_PAIR_WORK", 0)
-    surface = build._Surface(SURFACE, replace(REQUEST, transmission=transmission), 0.2)
-    jobs = build._Build(surface, (3, 4, 3), polarised=False)
+    fields = build_table.half_space
+    monkeypatch.setattr(build_table, "half_space", counting)
+    monkeypatch.setattr(build_table._Surface.solve, "__defaults__", (0, counting))
+    monkeypatch.setattr(build_table, "_PAIR_WORK", 0)
+    surface = build_table._Surface(SURFACE, replace(REQUEST, transmission=transmission), 0.2)
+    jobs = build_table._Build(surface, (3, 4, 3), polarised=False)
     work, counted = jobs.work(), []
     for job in range(len(jobs.jobs)):
         solved.clear()
@@ -318,22 +320,22 @@ def test_the_work_of_a_job_is_the_number_of_its_eigenproblems(transmission, monk
 @pytest.mark.filterwarnings("ignore:rigorous table")  # of few steps
 def test_a_build_succeeds_without_a_usable_checkpoint(tmp_path, monkeypatch):
     """The folder cannot be written to, or the checkpoint is damaged."""
-    monkeypatch.setattr(build, "_SOLVED_STEPS", ((6, 8, 6),))
-    monkeypatch.setattr(build, "_CHECK_COUNT", 10)
+    monkeypatch.setattr(build_table, "_SOLVED_STEPS", ((6, 8, 6),))
+    monkeypatch.setattr(build_table, "_CHECK_COUNT", 10)
     small = gratings.sinusoidal(0.15, 0.03, samples=32)
-    wanted = build_spectrum(small, REQUEST, checkpoints=tmp_path / "good").values
+    wanted = build_rigorous(small, REQUEST, checkpoints=tmp_path / "good").values
     (tmp_path / "file").write_text("")
-    np.testing.assert_array_equal(build_spectrum(small, REQUEST, checkpoints=tmp_path / "file" / "x").values, wanted)
+    np.testing.assert_array_equal(build_rigorous(small, REQUEST, checkpoints=tmp_path / "file" / "x").values, wanted)
 
     def leave(done, total):
         if done >= 3:
             raise InterruptedError
 
     with pytest.raises(InterruptedError):
-        build_spectrum(small, REQUEST, progress=leave, checkpoints=tmp_path)
+        build_rigorous(small, REQUEST, progress=leave, checkpoints=tmp_path)
     (checkpoint,) = tmp_path.glob("rigorous-*.npz")
     checkpoint.write_bytes(checkpoint.read_bytes()[:100])
-    np.testing.assert_array_equal(build_spectrum(small, REQUEST, checkpoints=tmp_path).values, wanted)
+    np.testing.assert_array_equal(build_rigorous(small, REQUEST, checkpoints=tmp_path).values, wanted)
 
 
 @pytest.mark.parametrize(

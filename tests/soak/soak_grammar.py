@@ -3,11 +3,14 @@
 from __future__ import annotations
 
 import functools
+import tempfile
 from dataclasses import dataclass, replace
+from pathlib import Path
 
 import mitsuba as mi
 import numpy as np
 from hypothesis import strategies as st
+from soak_model import Cauchy, index_of
 
 import mitsuba_diffraction as md
 
@@ -91,6 +94,7 @@ class At:
     orientation: float = 0.0
     height_scale: float = 1.0
     lateral_scale: float = 1.0
+    film_scale: float = 1.0
 
 
 @dataclass(frozen=True)
@@ -98,7 +102,11 @@ class Configuration:
     """A grating, and the light with which it is tried.
 
     Attributes:
-        orientation, height_scale, lateral_scale: numbers, or the values of four texels.
+        outside, coat: indices; that of a coat may be a `Cauchy`, as that of a material may.
+        films: indices and thicknesses, µm, from the outside in.
+        orientation, height_scale, lateral_scale, film_scale: numbers, or the values of four texels; the orientation
+            also "radial" or "tangential".
+        theory: scalar or rigorous.
         directions: (θ, φ, texel): degrees from the normal and from x, and which texel is hit.
         wavelengths: those of a ray, nm.
         render: whether pixels are rendered, which takes longer than all the rest.
@@ -110,8 +118,9 @@ class Configuration:
     representation: str = "auto"
     material: object = "none"
     outside: float = 1.0
-    coat: float | None = None
-    film: tuple | None = None
+    coat: float | Cauchy | None = None
+    films: tuple = ()
+    film_scale: float | tuple = 1.0
     transmission: str = "none"
     base: float | None = None
     orientation: float | tuple = 0.0
@@ -119,17 +128,25 @@ class Configuration:
     lateral_scale: float | tuple = 1.0
     shadowing: str = "v_cavity"
     conserve_energy: bool = True
+    theory: str = "scalar"
     polarised: bool = False
     render: bool = False
     directions: tuple = ((45.0, 0.0, 0),)
     wavelengths: tuple = (450.0, 500.0, 550.0, 620.0)
 
     def at(self, texel):
-        return At(*(_texel(getattr(self, name), texel) for name in ("orientation", "height_scale", "lateral_scale")))
+        """The parameters at a texel, those of a film and of lengths as factors."""
+        found = At(**{name: _texel(getattr(self, name), texel) for name in TEXTURES})
+        if isinstance(found.orientation, str):
+            u, v = uv(texel)
+            angle = float(np.degrees(np.arctan2(v - 0.5, u - 0.5)))
+            return replace(found, orientation=angle + 90 * (found.orientation == "tangential"))
+        return found
 
     @property
     def densest(self):
-        return max(self.outside, self.coat or 1.0, self.material if self.transmission != "none" else 1.0)
+        media = [self.outside, self.coat or 1.0, self.material if self.transmission != "none" else 1.0]
+        return max(float(index_of(medium, VISIBLE[0] * 1e-3).real) for medium in media)
 
     @property
     def max_lateral(self):
@@ -142,16 +159,24 @@ class Configuration:
 
     @property
     def is_discrete(self):
-        """Whether the plugin evaluates orders one by one."""
-        return self.extent == "tile" and (self.surface.is_line or self.is_resolved)
+        """Whether the plugin evaluates orders of scalar theory one by one."""
+        return self.extent == "tile" and (self.surface.is_line or self.is_resolved) and self.theory == "scalar"
 
     @property
     def conserves_energy(self):
-        return self.conserve_energy and self.shadowing == "v_cavity"
+        return (self.conserve_energy and self.shadowing == "v_cavity") or self.theory == "rigorous"
+
+    @property
+    def disperses(self):
+        return any(isinstance(medium, Cauchy) for medium in (self.material, self.coat))
 
     def spectrum(self):
         """The spectrum of the surface, for all light next to the relief."""
         scale = max(1.0, float(np.max(self.height_scale)), self.max_lateral)
+        if self.theory == "rigorous":
+            return _rigorous(
+                self.surface, self.coherence_length, self.material, self.coat or self.outside, self.transmission
+            )
         return _spectrum(
             self.surface,
             self.coherence_length,
@@ -174,14 +199,14 @@ class Configuration:
         if isinstance(self.material, str):
             result["material"] = self.material
         else:
-            result["int_ior"] = self.material
+            result["int_ior"] = given(self.material)
         if self.outside != 1 or not isinstance(self.material, str):
             result["ext_ior"] = self.outside
         if self.coat is not None:
-            result["coat_ior"] = self.coat
+            result["coat_ior"] = given(self.coat)
             result.setdefault("ext_ior", self.outside)
-        if self.film is not None:
-            result |= {"thin_film_ior": self.film[0], "thin_film_thickness": self.film[1]}
+        if self.films:
+            result |= self.of_films()
         if self.transmission != "none":
             result["transmission"] = self.transmission
         if self.base is not None:
@@ -192,12 +217,51 @@ class Configuration:
                 result[name] = texture(value)
             elif value != default:
                 result[name] = value
+        if self.theory == "rigorous":
+            return {name: value for name, value in (result | others).items() if value is not None}
         if self.shadowing != "v_cavity":
             result["shadowing"] = self.shadowing
         if not self.conserve_energy:
             result["conserve_energy"] = False
         result |= others
         return {name: value for name, value in result.items() if value is not None}
+
+    def of_films(self):
+        """The parameters of the films."""
+        if len(self.films) > 1:
+            lists = [", ".join(str(given(values[k])) for values in self.films) for k in (0, 1)]
+            result = {"thin_film_ior": lists[0], "thin_film_thickness": lists[1]}
+        else:
+            (n, thickness), scale = self.films[0], self.film_scale
+            if isinstance(scale, tuple) and self.surface.seed % 2:  # the same by another parameter
+                thicknesses = texture(tuple(thickness * s for s in scale))
+                return {"thin_film_ior": given(n), "thin_film_thickness": thicknesses}
+            result = {"thin_film_ior": given(n), "thin_film_thickness": thickness}
+        if self.film_scale != 1:
+            many = isinstance(self.film_scale, tuple)
+            result["thin_film_scale"] = texture(self.film_scale) if many else self.film_scale
+        return result
+
+
+TEXTURES = ("orientation", "height_scale", "lateral_scale", "film_scale")
+
+
+def given(medium):
+    """A medium as a scene has it: a number, a name, or the file of a table."""
+    return _file(medium) if isinstance(medium, Cauchy) else medium
+
+
+@functools.cache
+def _folder():
+    return tempfile.TemporaryDirectory()
+
+
+@functools.lru_cache(maxsize=4096)
+def _file(medium):
+    path = Path(_folder().name) / f"{medium.a:g}_{medium.b:g}.spd"
+    wavelengths = np.arange(340, 861)
+    path.write_text("".join(f"{w} {medium.at(w * 1e-3):.9g}\n" for w in wavelengths))
+    return str(path)
 
 
 def _texel(value, texel):
@@ -211,7 +275,8 @@ def texture(values):
 
 
 def uv(texel):
-    return (0.125 + 0.25 * texel, 0.5)
+    """The centre of a texel; v varies, for orientations from the centre of UV space."""
+    return (0.125 + 0.25 * texel, (0.2, 0.9, 0.35, 0.6)[texel])
 
 
 @functools.lru_cache(maxsize=256)
@@ -225,6 +290,23 @@ def _spectrum(surface, coherence_length, extent, representation, wavelengths):
         representation=representation,
         wavelengths=wavelengths,
         tolerance=1e-3 if surface.is_line or extent == "tile" else 1e-2,
+    )
+
+
+@functools.lru_cache(maxsize=64)
+def _rigorous(surface, coherence_length, material, above, transmission):
+    media = {"material": material} if isinstance(material, str) else {"int_ior": material}
+    (heights,) = surface.patches()
+    pixel = tuple(t / n for t, n in zip(surface.tile, heights.shape[::-1], strict=True))
+    return md.precompute(
+        md.HeightField(heights, pixel),
+        theory="rigorous",
+        coherence_length=coherence_length,
+        wavelengths=VISIBLE,
+        tolerance=2e-2,
+        ext_ior=above,
+        transmission=transmission,
+        **media,
     )
 
 
@@ -280,6 +362,8 @@ def configurations(draw):
     sample = draw(st.sampled_from([False] * 9 + [True]))
     surface = draw(surfaces(sample))
     transmission = draw(st.sampled_from(["none", "none", "interface", "sheet"]))
+    if not sample and draw(st.sampled_from([False] * 29 + [True])):
+        return draw(rigorous(transmission))
     index = _rounded(1.05, 4.0)
     if transmission != "none" and not surface.is_line and not sample:
         # Deeper ones take a minute to load.
@@ -287,27 +371,32 @@ def configurations(draw):
     if transmission != "none":
         outside = draw(st.one_of(st.just(1.0), _rounded(1.0, 1.6)))
         material = draw(st.one_of(st.just(1.5), index).filter(lambda n: abs(n - outside) > 0.03))
+        if draw(st.sampled_from([False, False, False, True])):
+            material = draw(media(outside + 0.03))
         coat = base = None
     else:
-        material = draw(st.one_of(st.just("none"), st.sampled_from(METALS), index))
-        coat = draw(st.one_of(st.none(), st.just(1.5), _rounded(1.05, 2.4)))
+        material = draw(
+            st.one_of(st.just("none"), st.sampled_from(METALS), index, st.sampled_from([False, True]).flatmap(_medium))
+        )
+        coat = draw(st.one_of(st.none(), st.just(1.5), _rounded(1.05, 2.4), media(1.05)))
         outside = 1.0
         if coat is not None or not isinstance(material, str):
             outside = draw(st.one_of(st.just(1.0), _rounded(1.0, 1.4)))
-            outside = min(outside, coat - 0.04) if coat else outside
+            outside = min(outside, coat_index(coat) - 0.04) if coat else outside
         base = draw(st.one_of(st.none(), _rounded(0.0, 1.0))) if not isinstance(material, str) else None
-    film = None
+    films, film_scale = (), 1.0
     if material != "none":
-        film = draw(
+        films = draw(
             st.one_of(
-                st.none(),
-                st.tuples(
-                    st.one_of(_rounded(1.05, 4.0), st.sampled_from(METALS)),
-                    st.one_of(_rounded(0.0, 0.3), _rounded(0.0, 2.0)),
-                ),
+                st.just(()),
+                st.tuples(st.tuples(film_media(), st.one_of(_rounded(0.0, 0.3), _rounded(0.0, 2.0)))),
+                st.lists(st.tuples(film_media(), _rounded(0.0, 0.25)), min_size=2, max_size=12).map(tuple),
             )
         )
-    densest = max(outside, coat or 1.0, material if transmission != "none" else 1.0)
+        if films:
+            film_scale = draw(_numbers(0.3, 1.5, 1.0))
+    of_media = [outside, coat or 1.0, material if transmission != "none" else 1.0]
+    densest = max(float(index_of(medium, VISIBLE[0] * 1e-3).real) for medium in of_media)
     lateral = draw(_numbers(0.4, 1.0, 1.0, not sample and draw(st.booleans())))
     longest = max(surface.period) * float(np.max(lateral))
     if sample:
@@ -339,13 +428,6 @@ def configurations(draw):
         representation = draw(st.sampled_from(["auto", "auto", "chebyshev", "taylor"]))
         if representation == "taylor" and surface.depth * densest * float(np.max(lateral)) > 0.4:
             representation = "auto"
-    grazing, inclined = _rounded(85, 89.9, 2), _rounded(0, 85, 2)
-    above = st.one_of(inclined, inclined, grazing)
-    theta = above if transmission == "none" else st.one_of(above, above.map(lambda angle: 180 - angle))
-    directions = st.lists(
-        st.tuples(theta, st.one_of(st.just(0.0), _rounded(0, 360, 1)), st.integers(0, 3)), min_size=1, max_size=3
-    )
-    wavelengths = draw(st.lists(_rounded(*VISIBLE, 1), min_size=4, max_size=4))
     return Configuration(
         surface=surface,
         coherence_length=coherence,
@@ -354,16 +436,73 @@ def configurations(draw):
         material=material,
         outside=outside,
         coat=coat,
-        film=film,
+        films=films,
+        film_scale=film_scale,
         transmission=transmission,
         base=base,
-        orientation=draw(_numbers(-360, 720, 0.0)),
+        orientation=draw(orientations()),
         height_scale=draw(heights),
         lateral_scale=lateral,
         shadowing=draw(st.sampled_from(["v_cavity", "v_cavity", "v_cavity", "none"])),
         conserve_energy=energy,
         polarised=draw(st.sampled_from([False] * 7 + [True])),
         render=draw(st.sampled_from([False] * 11 + [True])),
-        directions=tuple(draw(directions)),
-        wavelengths=tuple(wavelengths),
+        directions=draw(directions(transmission)),
+        wavelengths=draw(wavelengths()),
+    )
+
+
+def media(least):
+    """Media with dispersion, whose index in the red is at least the first argument."""
+    a, b = st.floats(max(least, 1.0), 2.3), st.floats(0.0, 0.03)
+    return st.builds(Cauchy, a.map(lambda x: round(x, 3)), b.map(lambda x: round(x, 4)))
+
+
+def _medium(transparent):
+    return media(1.05) if transparent else st.sampled_from(METALS)
+
+
+def film_media():
+    return st.one_of(_rounded(1.05, 4.0), st.sampled_from(METALS), media(1.1))
+
+
+def coat_index(coat):
+    """The least index of a coat."""
+    return float(index_of(coat, VISIBLE[1] * 1e-3).real)
+
+
+def orientations():
+    return st.one_of(_numbers(-360, 720, 0.0), st.sampled_from(["radial", "tangential"]))
+
+
+def directions(transmission):
+    grazing, inclined = _rounded(85, 89.9, 2), _rounded(0, 85, 2)
+    above = st.one_of(inclined, inclined, grazing)
+    theta = above if transmission == "none" else st.one_of(above, above.map(lambda angle: 180 - angle))
+    one = st.tuples(theta, st.one_of(st.just(0.0), _rounded(0, 360, 1)), st.integers(0, 3))
+    return st.lists(one, min_size=1, max_size=3).map(tuple)
+
+
+def wavelengths():
+    return st.lists(_rounded(*VISIBLE, 1), min_size=4, max_size=4).map(tuple)
+
+
+@st.composite
+def rigorous(draw, transmission):
+    """Draw a grating of rigorous theory whose table takes seconds."""
+    period = draw(_rounded(0.4, 0.8, 2))
+    kind = draw(st.sampled_from(["sinusoid", "triangle", "harmonics"]))
+    surface = Surface(kind, (period, period), draw(_rounded(0.02, 0.12)), 0.5, draw(st.integers(0, 99)))
+    material = draw(_rounded(1.3, 2.0, 2) if transmission != "none" else st.sampled_from(METALS))
+    return Configuration(
+        surface=surface,
+        coherence_length=round(draw(_rounded(8.5, 30)) * period, 2),
+        material=material,
+        coat=draw(st.sampled_from([None, 1.5])) if transmission == "none" else None,
+        transmission=transmission,
+        orientation=draw(orientations()),
+        theory="rigorous",
+        render=draw(st.sampled_from([False] * 3 + [True])),
+        directions=draw(directions(transmission)),
+        wavelengths=draw(wavelengths()),
     )

@@ -13,6 +13,8 @@ from pathlib import Path
 import mitsuba as mi
 import numpy as np
 
+NOMINAL = 0.547  # µm
+
 
 @functools.cache
 def metal(name):
@@ -22,34 +24,51 @@ def metal(name):
     return wavelengths / (1e4 if wavelengths[0] > 2000 else 1e3), n, k
 
 
+@dataclass(frozen=True)
+class Cauchy:
+    """A medium with the index a + b/λ², λ in µm, without absorption."""
+
+    a: float
+    b: float
+
+    def at(self, wavelength):
+        return self.a + self.b / wavelength**2
+
+
 def index_of(material, wavelength):
-    """n + ik at wavelengths in µm, of a metal or a number."""
+    """n + ik at wavelengths in µm, of a metal, a medium with dispersion or a number."""
+    if isinstance(material, Cauchy):
+        return material.at(wavelength) + 0j
     if isinstance(material, str):
         at, n, k = metal(material)
         return np.interp(wavelength, at, n) + 1j * np.interp(wavelength, at, k)
     return material + 0j * wavelength
 
 
-def plane(cosine, n_0, n_1, thickness, n_2, wavelength):
-    """R and T of a plane under a film, unpolarised (Airy). n_0 is real; shapes broadcast."""
-    n_0, n_1, n_2 = (np.asarray(n, complex) for n in (n_0, n_1, n_2))
+def plane(cosine, n_0, films, n_2, wavelength):
+    """R and T of a plane under films (n, d) from the outside in, unpolarised (Airy, film by film). n_0 is real."""
     cosine = np.clip(np.asarray(cosine, float), 1e-6, 1)
+    n_0, n_2 = np.asarray(n_0, complex) + 0 * cosine, np.asarray(n_2, complex) + 0 * cosine
     sine = n_0 * np.sqrt(1 - cosine**2)
 
     def normal(n):
         root = np.sqrt(n**2 - sine**2)  # n cos θ, decaying where it is complex
         return np.where(root.imag < 0, -root, root)
 
-    z_0, z_1, z_2 = (normal(n) for n in (n_0, n_1, n_2))
-    phase = np.exp(2j * np.pi * thickness * z_1 / wavelength)
+    media = [n_0, *(np.asarray(n, complex) + 0 * cosine for n, _ in films), n_2]
+    z = [normal(n) for n in media]
+    phases = [np.exp(2j * np.pi * d * z_j / wavelength) for (_, d), z_j in zip(films, z[1:], strict=False)]
     reflected, transmitted = 0, 0
-    for y_0, y_1, y_2 in ((z_0, z_1, z_2), (z_0 / n_0**2, z_1 / n_1**2, z_2 / n_2**2)):
-        r_01, r_12 = (y_0 - y_1) / (y_0 + y_1), (y_1 - y_2) / (y_1 + y_2)
-        below = 1 + r_01 * r_12 * phase**2
-        r = (r_01 + r_12 * phase**2) / below
-        t = (2 * y_0 / (y_0 + y_1)) * (2 * y_1 / (y_1 + y_2)) * phase / below  # of the field whose admittance is y
+    for y in (z, [z_j / n**2 for z_j, n in zip(z, media, strict=True)]):
+        r, t = 0.0, 1.0  # of all that is below a face; t of the field whose admittance is y
+        for j in range(len(films), -1, -1):
+            phase = phases[j] if j < len(films) else 1.0
+            face = (y[j] - y[j + 1]) / (y[j] + y[j + 1])
+            below = 1 + face * r * phase**2
+            t = 2 * y[j] / (y[j] + y[j + 1]) * phase * t / below
+            r = (face + r * phase**2) / below
         reflected = reflected + np.abs(r) ** 2 / 2
-        transmitted = transmitted + np.abs(t) ** 2 * y_2.real / y_0.real / 2
+        transmitted = transmitted + np.abs(t) ** 2 * y[-1].real / y[0].real / 2
     return reflected, transmitted
 
 
@@ -103,47 +122,51 @@ class Model:
         self.sigma_q = 1 / (2 * np.sqrt(2) * np.pi * c.coherence_length / 4)
 
     # The media.
-    def way(self, omega, orientation):
-        """`omega` (n, 3) in the local frame → along the axes of the pattern."""
+    def way(self, omega, wavelength, orientation):
+        """`omega` (n, 3) in the local frame → along the axes of the pattern. Wavelengths (n,) or a number."""
         angle = np.deg2rad(orientation)
         cos, sin = np.cos(angle), np.sin(angle)
         along = np.stack([cos * omega[:, 0] + sin * omega[:, 1], cos * omega[:, 1] - sin * omega[:, 0]], -1)
         above = omega[:, 2] > 0
-        outer, inner = self.indices(above)
+        outer, inner = self.indices(above, wavelength)
         return Way(along * outer[:, None], outer, inner, np.where(above, 1.0, -1.0))
 
-    def indices(self, above):
-        """n outside and next to the relief, above or below."""
+    def above(self, wavelength):
+        """n next to the relief, above it."""
+        return index_of(self.c.coat or self.c.outside, wavelength).real
+
+    def indices(self, above, wavelength):
+        """n outside and next to the relief, above or below, at wavelengths in µm that broadcast."""
         c = self.c
-        inner_above = c.coat or c.outside
-        below = c.material if c.transmission != "none" else np.nan
+        inner_above = self.above(wavelength)
+        below = index_of(c.material, wavelength).real if c.transmission != "none" else np.nan
         inner = np.where(above, inner_above, below)
         outer = np.where(above, c.outside, c.outside if c.transmission == "sheet" else below)
         return outer, inner
 
-    def of_plane(self, cosine, from_above, wavelength):
+    def of_plane(self, cosine, from_above, wavelength, at):
         """R and T of the material next to the relief, at the angle of a facet."""
         c = self.c
         if c.material == "none":
             return np.ones_like(cosine), np.zeros_like(cosine)
-        n_0 = np.full_like(cosine, c.coat or c.outside)
-        n_2 = index_of(c.material, wavelength)
-        n_1, thickness = (n_0, 0.0) if c.film is None else (index_of(c.film[0], wavelength), c.film[1])
-        above, below = plane(cosine, n_0, n_1, thickness, n_2, wavelength), None
+        # A coat with dispersion has its nominal index for the reflectance of the material.
+        n_0, n_2 = self.above(NOMINAL if isinstance(c.coat, Cauchy) else wavelength), index_of(c.material, wavelength)
+        films = [(index_of(n, wavelength), at.film_scale * thickness) for n, thickness in c.films]
+        above = plane(cosine, n_0, films, n_2, wavelength)
         if np.all(from_above):
             return above
-        below = plane(cosine, n_2, n_1, thickness, n_0, wavelength)
+        below = plane(cosine, n_2, films[::-1], n_0, wavelength)
         return tuple(np.where(from_above, a, b) for a, b in zip(above, below, strict=True))
 
-    def face(self, omega):
+    def face(self, omega, wavelength):
         """T of the face of a coat, or of the flat face of a sheet, for directions outside."""
-        c, one = self.c, np.ones(len(omega))
+        c, cosine = self.c, np.abs(omega[:, 2])
         if c.coat:
-            return plane(np.abs(omega[:, 2]), c.outside, c.coat, 0.0, c.coat, one)[1]
+            return plane(cosine, c.outside, [], self.above(wavelength), 1.0)[1]
         if c.transmission == "sheet":
-            transmitted = plane(np.abs(omega[:, 2]), c.outside, c.material, 0.0, c.material, one)[1]
+            transmitted = plane(cosine, c.outside, [], index_of(c.material, wavelength), 1.0)[1]
             return np.where(omega[:, 2] < 0, transmitted, 1)
-        return one
+        return np.ones(len(omega))
 
     # The relief.
     def eta(self, m, kappa):
@@ -190,8 +213,8 @@ class Model:
 
     def orders(self, omega, wavelength, below, at):
         """Orders that propagate from one ω_i (3,) at one wavelength: m (n, 2) and ω_o (n, 3) in the local frame."""
-        way = self.way(omega[None], at.orientation)
-        outer, _ = self.indices(np.array([not below]))
+        way = self.way(omega[None], wavelength, at.orientation)
+        outer, _ = self.indices(np.array([not below]), wavelength)
         tile = self.tile * at.lateral_scale
         limit = np.floor((way.outer + outer) * tile / wavelength).astype(int)
         limit = np.where(np.array(self.patches[0].shape[::-1]) == 1, 0, limit)
@@ -210,7 +233,7 @@ class Model:
 
         f = the product of the first three, without E, the faces and the base.
         """
-        i, o = self.way(wi, at.orientation), self.way(wo, at.orientation)
+        i, o = (self.way(omega, wavelength, at.orientation) for omega in (wi, wo))
         reflects = i.sign == o.sign
         q = -(i.tangent + o.tangent) / wavelength[:, None]
         order_q = m / (self.tile * at.lateral_scale)
@@ -229,13 +252,13 @@ class Model:
         v = np.sqrt((wavelength * np.linalg.norm(q, axis=-1)) ** 2 + pair**2)
         excess = np.where(reflects, 0, i.inner**2 - o.inner**2)
         i_h = np.minimum(np.abs(v**2 + excess) / (2 * v * i.inner), 1)
-        reflected, transmitted = self.of_plane(i_h, i.sign > 0, wavelength)
+        reflected, transmitted = self.of_plane(i_h, i.sign > 0, wavelength, at)
         common = np.where(reflects, reflected, transmitted) * factor * gain(x_i) * gain(x_o) * propagates
         common = common * o.outer**2 / wavelength**2
         lobe = np.exp(-((q - order_q) ** 2).sum(-1) / (2 * self.sigma_q**2)) / (2 * np.pi * self.sigma_q**2)
         return common, self.eta(m, kappa), lobe, np.abs(kappa)
 
-    def of_base(self, wi, wo, wavelength):
+    def of_base(self, wi, wo, wavelength, at):
         """f of the base below the relief."""
         c, result = self.c, 1.0
         if c.base is None:
@@ -243,8 +266,8 @@ class Model:
         for omega in (wi, wo):
             cos = omega[:, 2]
             if c.coat:
-                cos = np.sqrt(1 - (1 - cos**2) * (c.outside / c.coat) ** 2)
-            result = result * self.of_plane(cos, True, wavelength)[1]
+                cos = np.sqrt(1 - (1 - cos**2) * (c.outside / self.above(wavelength)) ** 2)
+            result = result * self.of_plane(cos, True, wavelength, at)[1]
         return result * c.base / np.pi
 
     def albedo(self, omega, wavelength, at):
@@ -254,6 +277,6 @@ class Model:
             m, wo = self.orders(omega, wavelength, below, at)
             wi = np.repeat(omega[None], len(m), axis=0)
             common, eta, _, _ = self.terms(wi, wo, m, np.full(len(m), wavelength), at)
-            outer, _ = self.indices(wo[:, 2] > 0)
+            outer, _ = self.indices(wo[:, 2] > 0, wavelength)
             totals.append((common * eta * wavelength**2 / outer**2).sum())
         return totals

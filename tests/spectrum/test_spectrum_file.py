@@ -17,7 +17,7 @@ import mitsuba_diffraction as md
 from mitsuba_diffraction import GratingSpectrum
 from mitsuba_diffraction.energy.table import EnergyTable, Layout
 from mitsuba_diffraction.files import seal
-from mitsuba_diffraction.grating_spectrum import FORMAT_VERSION
+from mitsuba_diffraction.grating_spectrum import SCALAR_FORMAT_VERSION
 from mitsuba_diffraction.spectrum.grids import SplineGrid
 from mitsuba_diffraction.spectrum.tables import SliceTable
 
@@ -208,7 +208,7 @@ def refusal(path, kind=ValueError, change="it is none"):
 
 
 def test_another_version_is_refused(saved):
-    for version in (FORMAT_VERSION - 1, FORMAT_VERSION + 1):
+    for version in (SCALAR_FORMAT_VERSION - 1, SCALAR_FORMAT_VERSION + 1):
         rewrite(saved[1], {"formatVersion": version})
         assert f"version {version}" in refusal(saved[1])
 

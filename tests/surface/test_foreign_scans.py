@@ -184,9 +184,9 @@ def test_a_jpk_image_of_a_part_of_the_grid_has_its_pixels(tmp_path):
 @needs_the_extra
 def test_curves_of_jpk_are_not_unpacked(tmp_path, monkeypatch):
     (tmp_path / "scan.jpk-qi-data").write_bytes(jpk(image="data-image.jpk-qi-image", curves=300_000))
-    monkeypatch.setattr(mended, "MAX_BYTES", 100_000)
+    monkeypatch.setattr(mended, "MAX_ARRAY_BYTES", 100_000)
     check(tmp_path / "scan.jpk-qi-data")
-    monkeypatch.setattr(mended, "MAX_BYTES", 1000)
+    monkeypatch.setattr(mended, "MAX_ARRAY_BYTES", 1000)
     with pytest.raises(ValueError, match=r"got an image of .* wanted at most 1000"):
         read_height_field(tmp_path / "scan.jpk-qi-data")
     (tmp_path / "scan.jpk-qi-data").write_bytes(jpk(image="data-image.other"))

@@ -202,7 +202,7 @@ def test_an_archive_that_unpacks_to_too_much_is_refused(tmp_path, monkeypatch):
 
     with zipfile.ZipFile(tmp_path / "scan.x3p", "w", zipfile.ZIP_DEFLATED) as archive:
         archive.writestr("main.xml", bytes(100_000))
-    monkeypatch.setattr(instruments, "MAX_BYTES", 1000)
+    monkeypatch.setattr(instruments, "MAX_ARRAY_BYTES", 1000)
     with pytest.raises(ValueError, match="an archive of 100000 bytes, wanted at most 1000"):
         read_height_field(tmp_path / "scan.x3p")
 

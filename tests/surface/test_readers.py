@@ -343,7 +343,7 @@ def test_a_header_that_claims_too_many_pixels_is_refused(tmp_path, refuse, side)
 
 def test_an_archive_that_unpacks_to_too_much_is_refused(tmp_path, refuse, monkeypatch):
     np.savez_compressed(tmp_path / "scan.npz", heights=np.zeros((100, 100)))
-    monkeypatch.setattr("mitsuba_diffraction.surface.readers.pictures.MAX_BYTES", 1000)
+    monkeypatch.setattr("mitsuba_diffraction.surface.readers.images.MAX_ARRAY_BYTES", 1000)
     refuse("scan.npz", "wanted at most 1000")
 
 

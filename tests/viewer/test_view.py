@@ -16,7 +16,7 @@ from mitsuba_diffraction.color import daylight, matching_functions
 from mitsuba_diffraction.recipe import Recipe
 from mitsuba_diffraction.spectrum.tables import SliceTable
 from mitsuba_diffraction.viewer import page as pages
-from mitsuba_diffraction.viewer.surface import MAX_LAYERS, Surface
+from mitsuba_diffraction.viewer.viewed_surface import MAX_LAYERS, Surface
 
 RECIPES = Path(__file__).parents[2] / "precompute"
 SMALL = "blazed,depth=0.02,samples=32,coherence_length=2"
@@ -89,7 +89,7 @@ def test_a_page_holds_everything_is_small_and_ready_within_three_seconds(recipe)
     start = time.process_time()
     text = pages.page(Surface.named(recipe, {}))
     assert time.process_time() - start < 3
-    assert len(text.encode()) < pages.MAX_BYTES
+    assert len(text.encode()) < pages.MAX_PAGE_BYTES
     assert not re.search(r"(src|href)\s*=\s*[\"'](?!data:)|https?://(?!www\.w3\.org)|@import|\{\{", text)
 
 
@@ -137,7 +137,7 @@ def test_tables_too_large_for_a_texture_are_refused():
 
 
 def test_a_large_page_is_refused(monkeypatch):
-    monkeypatch.setattr(pages, "MAX_BYTES", 100_000)
+    monkeypatch.setattr(pages, "MAX_PAGE_BYTES", 100_000)
     with pytest.raises(ValueError, match=r"got a page of .* MB, wanted at most 0.1; a larger tolerance"):
         md.view("blazed", depth=0.02, samples=32, coherence_length=2.0)
 

@@ -19,7 +19,7 @@ from .cases import Case
 
 Array = NDArray[np.float64]
 
-PATCHES = tuple(direction(np.array([30.0, -45.0, -15.0, -5.0, 10.0, 45.0, 60.0]), azimuth) for azimuth in (0.0, 90.0))
+_PATCHES = tuple(direction(np.array([30.0, -45.0, -15.0, -5.0, 10.0, 45.0, 60.0]), azimuth) for azimuth in (0.0, 90.0))
 """ω_i and six ω_o in each of the planes x and y: (7, 3)."""
 
 
@@ -134,4 +134,4 @@ def patch_difference(exact: Array, approximate: Array) -> tuple[float, float]:
 
 def patch_directions() -> tuple[Array, Array]:
     """Return ω_i and ω_o of the patches, (12, 3) each."""
-    return np.repeat([plane[0] for plane in PATCHES], 6, axis=0), np.concatenate([plane[1:] for plane in PATCHES])
+    return np.repeat([plane[0] for plane in _PATCHES], 6, axis=0), np.concatenate([plane[1:] for plane in _PATCHES])

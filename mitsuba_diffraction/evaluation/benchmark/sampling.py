@@ -17,13 +17,13 @@ from ...settings import VISIBLE
 from .cases import Case
 from .speed import seconds
 
-ANGLES = (0.0, 30.0, 60.0, 75.0, 85.0)
+_ANGLES = (0.0, 30.0, 60.0, 75.0, 85.0)
 _AZIMUTHS = (0.0, 30.0, 60.0, 90.0)
 _WAVELENGTH_DRAWS = 4  # sets of four wavelengths
 
-COLUMNS = {
+SAMPLING_COLUMNS = {
     "surface": "{.surface}",
-    **{f"fraction\n{angle:g}°": f"{{0.fractions[{index}]:.2f}}" for index, angle in enumerate(ANGLES)},
+    **{f"fraction\n{angle:g}°": f"{{0.fractions[{index}]:.2f}}" for index, angle in enumerate(_ANGLES)},
     "largest\nweight": "{.largest_weight:.1f}",
     "variance of\ncosine sampling": "{.variance_ratio:.0f}",
     "picture\ntime": "{.picture_ratio:.2f}",
@@ -36,7 +36,7 @@ class Sampling:
 
     Attributes:
         surface: name of the case.
-        fractions: E[w]²/E[w²] at each of `ANGLES`, the minimum over azimuths; R = 1.
+        fractions: E[w]²/E[w²] at each of `_ANGLES`, the minimum over azimuths; R = 1.
         largest_weight: maximum weight of all samples drawn.
         variance_ratio: of cosine sampling to the BSDF's own, under a uniform sky, at equal time; the minimum
             over angles.
@@ -75,7 +75,7 @@ def measure(
     for case in cases:
         grating = {"type": "diffraction_grating", "spectrum": case.spectrum(tolerance=tolerance)}
         mirror = mi.load_dict({**grating, "material": "none"})
-        fractions, max_weights = zip(*(_fraction(mirror, angle, count) for angle in ANGLES), strict=True)
+        fractions, max_weights = zip(*(_fraction(mirror, angle, count) for angle in _ANGLES), strict=True)
         pictures = {
             "grating": _sphere({**grating, "material": "Al"}, size),
             "rough": _sphere({"type": "roughconductor", "material": "Al"}, size),
@@ -87,7 +87,7 @@ def measure(
                 surface=case.name,
                 fractions=fractions,
                 largest_weight=max(max_weights),
-                variance_ratio=min(_against_cosine(mirror, angle, count, repetitions) for angle in ANGLES),
+                variance_ratio=min(_against_cosine(mirror, angle, count, repetitions) for angle in _ANGLES),
                 picture_ratio=taken["grating"] / taken["rough"],
             )
         )

@@ -11,9 +11,9 @@ import numpy as np
 
 from ...geometry import k_g
 from ...testing import vectors
-from ..realtime_shader.base import Shader
 from ..realtime_shader.evaluate import shader_for
 from ..realtime_shader.quirks import Quirks
+from ..realtime_shader.shader import Shader
 from ..realtime_shader.tristimulus import PUBLISHED_R0
 from .accuracy import Exact, patch_difference, patch_directions
 from .cases import Case
@@ -21,7 +21,7 @@ from .speed import Rays, seconds
 
 _SHADERS = (("flss", "as published"), ("flss", "corrected"), ("nmm", "as published"), ("pq", "as published"))
 
-COLUMNS = {
+SHADER_COLUMNS = {
     "surface": "{.surface}",
     "shader": "{.shader}",
     "texel reads": "{.texel_reads}",

@@ -25,8 +25,8 @@ from ...settings import ORIGINS, SERIES, VISIBLE
 from ...spectrum.grids import OrderGrid
 from ...spectrum.tables import AmplitudeTable, SliceTable, series_function, series_weights
 from ..plots import figure
-from ..realtime_shader.base import TextureShader
 from ..realtime_shader.flss import FLSS
+from ..realtime_shader.shader import TextureShader
 from ..report import cells
 from .accuracy import Exact
 from .cases import Case
@@ -329,7 +329,7 @@ class Found:
     methods: list[Method]
 
 
-def run(cases: Sequence[Case], timed: Sequence[str], progress: Progress = silent, **settings: int) -> Found:
+def measure_terms(cases: Sequence[Case], timed: Sequence[str], progress: Progress = silent, **settings: int) -> Found:
     """Measure tiles under the current variant.
 
     Args:
@@ -359,7 +359,7 @@ BOUND_COLUMNS = {
 }
 
 
-def tables(found: Found) -> list[Table]:
+def terms_tables(found: Found) -> list[Table]:
     """Return the tables for a terminal."""
     bound_rows = [cells(BOUND_COLUMNS, bound) for bound in found.bounds]
     return [table(*error_table(found)), table(BOUND_COLUMNS, bound_rows), table(*method_table(found), texts=2)]
@@ -401,7 +401,7 @@ _WIDTHS = {"float32": 1.7, "float64": 0.8}
 _SHOWN_ERRORS = 1e-15, 1e3
 
 
-def plot(found: Found) -> Figure:
+def plot_terms(found: Found) -> Figure:
     """Plot errors and bounds against the number of terms: ∫|ΔS| dq above, max |Δη|/η below, a column for each tile."""
     surfaces = list(dict.fromkeys(e.surface for e in found.errors))
     drawn = figure(2.6 * len(surfaces) + 0.6, 6.6)

@@ -32,9 +32,9 @@ def benchmark(
     import mitsuba as mi
 
     from ...llvm import choose_variant
-    from ..benchmark.benchmark import TOLERANCES, run, save_plot, tables
     from ..benchmark.cases import bundled_cases, scan_case
     from ..benchmark.sampling import measure
+    from ..benchmark.study import TOLERANCES, benchmark_tables, run_benchmark, save_speed_plot
 
     if plot is not None:
         check_suffix("--plot", plot, ".png")
@@ -54,16 +54,16 @@ def benchmark(
         _measure_terms(json, plot)
         return
     with progress_bar("speed and error") as progress:
-        results, shaders = run(cases, tolerances=tolerance or TOLERANCES, progress=progress)
+        results, shaders = run_benchmark(cases, tolerances=tolerance or TOLERANCES, progress=progress)
     with progress_bar("sampling") as progress:
         # Pictures need no more.
         sampling = measure(cases, max(tolerance or TOLERANCES), progress=progress)
-    show(*tables(results, shaders, sampling), width=140)
+    show(*benchmark_tables(results, shaders, sampling), width=140)
     if json is not None:
         found = {"speed and error": results, "real-time shader": shaders, "sampling": sampling}
         outputs.save_json(found, json)
     if plot is not None:
-        save_plot(results, plot)
+        save_speed_plot(results, plot)
 
 
 def _measure_terms(json: Path | None, plot: Path | None) -> None:
@@ -72,9 +72,9 @@ def _measure_terms(json: Path | None, plot: Path | None) -> None:
     from ..plots import save_png
 
     with progress_bar("number of terms") as progress:
-        found = terms.run(tiles(), TIMED_TILES, progress=progress)
-    show(*terms.tables(found), width=190)
+        found = terms.measure_terms(tiles(), TIMED_TILES, progress=progress)
+    show(*terms.terms_tables(found), width=190)
     if json is not None:
         outputs.save_json(found, json)
     if plot is not None:
-        save_png(terms.plot(found), plot)
+        save_png(terms.plot_terms(found), plot)

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from ... import outputs
-from ...cli.arguments import Define, Overwrite, Variant, check_suffix, numbers, scene_parameters
+from ...cli.arguments import Define, Overwrite, Variant, check_suffix, parse_numbers, scene_parameters
 from ...errors import RequestError
 from ...progress import progress_bar, show, table, tell
 from ...settings import ORIGINS
@@ -51,13 +51,13 @@ def convergence(
 
     parameters = scene_parameters(define)
     if terms is None:
-        tolerances = sorted(tolerance or study.TOLERANCES, reverse=True)
+        tolerances = sorted(tolerance or study.PICTURE_TOLERANCES, reverse=True)
         study.check_tolerances(tolerances)
         own = {"tolerance": f"{tolerances[0]:g}"}
     elif tolerance or reference_spp or len(spp or []) > 1:
         raise RequestError("--terms: got --tolerance, --reference-spp or several --spp, too; wanted at most one --spp")
     else:
-        counts = [int(count) if count.is_integer() else count for count in numbers("--terms", terms).tolist()]
+        counts = [int(count) if count.is_integer() else count for count in parse_numbers("--terms", terms).tolist()]
         own = {"representation": "auto", "terms": "auto", "heights_from": ORIGINS[0]}
     check_suffix("-o", plot, ".png")
     written = [("-o", plot), *([("--json", json)] if json is not None else [])]
@@ -69,7 +69,7 @@ def convergence(
             scene,
             terms=counts,
             origins=ORIGINS if origin is None else (origin,),
-            samples=spp[0] if spp else series.SAMPLES,
+            samples=spp[0] if spp else series.SERIES_SAMPLES,
             width=width,
             parameters=parameters,
             progress=progress_bar,
@@ -79,16 +79,16 @@ def convergence(
     found = study.convergence(
         scene,
         tolerances=tolerances,
-        samples=sorted(spp or study.SAMPLES),
+        samples=sorted(spp or study.SAMPLE_COUNTS),
         reference_samples=reference_spp or 2048,
         width=width,
         parameters=parameters,
         progress=progress_bar,
     )
-    study.save_plot(found, plot)
+    study.save_convergence_plot(found, plot)
     if json is not None:
         outputs.save_json(found, json)
-    show(table(study.COLUMNS, (cells(study.COLUMNS, point) for point in found.points)), width=100)
+    show(table(study.POINT_COLUMNS, (cells(study.POINT_COLUMNS, point) for point in found.points)), width=100)
     for name, curve in found.curves().items():
         if not curve[0].traced:
             times = [found.overtaken(name, error) for error in ("delta_e", "relative_mse")]
@@ -102,7 +102,7 @@ def _report_series(found: SeriesStudy, plot: Path, json: Path | None) -> None:
     from ..comparison import series
     from ..plots import save_png
 
-    save_png(series.plot(found), plot)
+    save_png(series.plot_series(found), plot)
     if json is not None:
         outputs.save_json({"scene": found.scene, "samples": found.samples, "rows": found.rows}, json)
-    show(table(series.COLUMNS, (cells(series.COLUMNS, row) for row in found.rows), texts=2), width=120)
+    show(table(series.SERIES_COLUMNS, (cells(series.SERIES_COLUMNS, row) for row in found.rows), texts=2), width=120)

@@ -1,5 +1,5 @@
 """The path tracer with this project's BSDF against the real-time shader, on one scene."""
 
-from .comparison import Comparison, compare
+from .side_by_side import Comparison, compare
 
 __all__ = ["Comparison", "compare"]

@@ -22,12 +22,12 @@ from ...settings import MIN_TOLERANCE
 from .difference import as_shown, difference, noise, time_of_error, white_luminance
 from .pictures import Picture, Pictures
 
-TOLERANCES = (1e-1, 1e-2, 1e-3)
-SAMPLES = (1, 4, 16, 64, 256)
+PICTURE_TOLERANCES = (1e-1, 1e-2, 1e-3)
+SAMPLE_COUNTS = (1, 4, 16, 64, 256)
 SHADERS = ("flss", "nmm", "pq")
 SAMPLES_OF_OTHERS_PER_POINT = 4  # samples of all BSDFs other than gratings, per shading point
 
-COLUMNS = {
+POINT_COLUMNS = {
     "picture": "{.name}",
     "samples": "{.samples}",
     "seconds": "{.seconds:.3g}",
@@ -111,8 +111,8 @@ def check_tolerances(tolerances: Sequence[float]) -> None:
 def convergence(
     scene_path: str | os.PathLike[str],
     *,
-    tolerances: Sequence[float] = TOLERANCES,
-    samples: Sequence[int] = SAMPLES,
+    tolerances: Sequence[float] = PICTURE_TOLERANCES,
+    samples: Sequence[int] = SAMPLE_COUNTS,
     reference_samples: int = 2048,
     shaders: Sequence[str] = SHADERS,
     shading_points: Sequence[int] = (1, 4, 16),
@@ -180,7 +180,7 @@ def convergence(
     return Convergence(scene, (columns, rows), noise(reference.halves, of.surface, white), tuple(points))
 
 
-def save_plot(found: Convergence, path: str | os.PathLike[str]) -> None:
+def save_convergence_plot(found: Convergence, path: str | os.PathLike[str]) -> None:
     """Plot both errors against time: down is more accurate, left is faster."""
     from matplotlib import colormaps
     from matplotlib.figure import Figure

@@ -19,16 +19,16 @@ from ...color import spectrum_to_XYZ
 from ...errors import RequestError
 from ...progress import Progress, part, silent
 from ...render import SpectralImage
-from ...render.film import check_memory, collect, equal_ranges, pass_seed, rotated, sampler_of, trace_pass
+from ...render.film import check_memory, collect, equal_ranges, pass_seed, rotated_sampler, sampler_of, trace_pass
 from ...render.passes import Accumulation, ratio, split
 from ...render.scene import channel_wavelengths, load_spectral_scene, parsed, recorded_range
 from ...settings import VISIBLE
 from ..realtime_shader import tristimulus
-from ..realtime_shader.base import Shader, TextureShader
+from ..realtime_shader.diffraction_shader import PUBLISHED_BRIGHTNESS, checked_brightness, parameters_of_variant
 from ..realtime_shader.flss import FLSS
-from ..realtime_shader.integrator import PUBLISHED_BRIGHTNESS, checked_brightness, settings_of
 from ..realtime_shader.lights import lights_of
 from ..realtime_shader.quirks import Quirks
+from ..realtime_shader.shader import Shader, TextureShader
 from ..realtime_shader.surfaces import gratings_of, sum_along
 from ..realtime_shader.tristimulus import EMISSION, primary_spectra
 
@@ -106,7 +106,7 @@ LUMINANCE = (0.2126, 0.7152, 0.0722)  # of linear sRGB (IEC 61966-2-1)
 # Some seconds of work on two cores, so that progress is shown.
 _MAX_POINTS_PER_DISPATCH = 2**16
 
-Colour = Callable[["mi.RayDifferential3f"], "mi.Color3f"]
+ColourOfRay = Callable[["mi.RayDifferential3f"], "mi.Color3f"]
 """Ray → linear sRGB of the gratings that it meets."""
 
 
@@ -208,7 +208,7 @@ class Pictures:
 
     def use(self, shader: str) -> None:
         """Choose the shader, one of `VARIANTS`, of the next pictures."""
-        own = {name: value for name, value in self._settings.items() if name in settings_of(shader)}
+        own = {name: value for name, value in self._settings.items() if name in parameters_of_variant(shader)}
         brightness = self._brightness or PUBLISHED_BRIGHTNESS
         request = {"type": "diffraction_shader", "variant": shader, "brightness": brightness, **own}
         self._shader = mi.load_dict(request)
@@ -320,7 +320,7 @@ class Pictures:
 
     def _at_points(
         self,
-        colour: Colour,
+        colour: ColourOfRay,
         samples: int,
         others: int,
         progress: Progress,
@@ -382,7 +382,7 @@ class Pictures:
         return Picture(image, sums.samples, seconds, halves=in_halves)
 
     def _colours(
-        self, colour: Colour, samples: int, half: int, progress: Progress
+        self, colour: ColourOfRay, samples: int, half: int, progress: Progress
     ) -> tuple[NDArray[np.float64], float]:
         """Return linear sRGB of the gratings, (height, width, 3), and seconds; `half` selects the random numbers."""
         rows, columns = self.surface.shape
@@ -408,7 +408,7 @@ class Pictures:
         values = np.array(sums, np.float64).reshape(rows, columns, 4)
         return ratio(values[..., :3], values[..., 3:])
 
-    def _shade(self, colour: Colour, first: int, count: int, samples: int, half: int) -> NDArray[np.float32]:
+    def _shade(self, colour: ColourOfRay, first: int, count: int, samples: int, half: int) -> NDArray[np.float32]:
         """Shade points of `count` pixels, from `first` on: (5, n), position in the picture and linear sRGB."""
         sensor = self.scene.sensors()[0]
         columns, rows = (int(size) for size in sensor.film().crop_size())
@@ -418,7 +418,7 @@ class Pictures:
         seed = pass_seed(self.seed, 2 * first + half)
         sampler.seed(seed, count * samples)
         pixel = dr.opaque(mi.UInt32, first) + dr.arange(mi.UInt32, count * samples) // samples
-        sampler = rotated(sampler, seed, pixel)
+        sampler = rotated_sampler(sampler, seed, pixel)
         position = mi.Point2f(mi.Float(pixel % columns), mi.Float(pixel // columns)) + sampler.next_2d()
         # Colours are of all wavelengths: 0.5 is a dummy.
         size = mi.Vector2f(columns, rows)

@@ -37,10 +37,10 @@ from .pictures import Picture
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
-TERMS = (4, 6, 8, 10, 15, 20)
-SAMPLES = 16
+SERIES_TERMS = (4, 6, 8, 10, 15, 20)
+SERIES_SAMPLES = 16
 
-COLUMNS = {
+SERIES_COLUMNS = {
     "spectrum": "{.name}",
     "heights from": "{.heights_from}",
     "∫|ΔS| dq": "{.spectrum_error:.1e}",
@@ -106,9 +106,9 @@ class SeriesStudy:
 def study(
     scene_path: str | os.PathLike[str],
     *,
-    terms: Sequence[int] = TERMS,
+    terms: Sequence[int] = SERIES_TERMS,
     origins: Sequence[str] = ORIGINS,
-    samples: int = SAMPLES,
+    samples: int = SERIES_SAMPLES,
     width: int | None = None,
     parameters: Mapping[str, str] | None = None,
     progress: Callable[[str], AbstractContextManager[Progress]] = no_progress,
@@ -221,7 +221,7 @@ def _delta_e(
     return delta_E(*(as_shown(one[where] / white) for one in (xyz, reference)))
 
 
-def plot(found: SeriesStudy) -> Figure:
+def plot_series(found: SeriesStudy) -> Figure:
     """Plot the pictures of each number of terms and of slices, CIEDE2000 below them, and errors and times."""
     from matplotlib.figure import Figure
 

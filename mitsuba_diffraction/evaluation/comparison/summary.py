@@ -15,10 +15,10 @@ from ...files import whole_file
 from ...outputs import METADATA
 from ...progress import table
 from .. import report
-from ..realtime_shader.integrator import PUBLISHED_BRIGHTNESS
-from .comparison import Comparison
+from ..realtime_shader.diffraction_shader import PUBLISHED_BRIGHTNESS
 from .pictures import NO_SHADOWS
 from .quirk_shares import MIN_EFFECT, QuirkShares
+from .side_by_side import Comparison
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -192,7 +192,7 @@ def shown(comparison: Comparison, name: str) -> NDArray[np.uint8]:
     return on_screen(into_gamut(XYZ_to_linear_sRGB(xyz)))
 
 
-def figure(comparison: Comparison) -> Figure:
+def comparison_figure(comparison: Comparison) -> Figure:
     """Plot the pictures, four to a row, below them CIEDE2000 to the path tracer's, and the effects of the quirks."""
     from matplotlib.figure import Figure
 
@@ -250,4 +250,4 @@ def _bars(panel: Axes, shares: QuirkShares) -> None:
 def save_figure(comparison: Comparison, path: str | os.PathLike[str], dpi: float = 110) -> None:
     """Write `figure` as PNG, atomically."""
     with whole_file(path) as temporary:
-        figure(comparison).savefig(temporary, format="png", dpi=dpi, metadata=METADATA)
+        comparison_figure(comparison).savefig(temporary, format="png", dpi=dpi, metadata=METADATA)

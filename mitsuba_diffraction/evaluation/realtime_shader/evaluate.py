@@ -12,13 +12,13 @@ from ...errors import RequestError
 from ...llvm import is_supported
 from ...surface.heightfield import HeightField
 from ...testing import array, vectors
-from .base import Shader, TextureShader
 from .flss import FLSS
 from .gem import GEM
 from .nmm import NMM
 from .nmm_pq import NMMPQ
 from .pq import PQ
 from .quirks import Quirks
+from .shader import Shader, TextureShader
 
 VARIANTS = {"flss": FLSS, "nmm": NMM, "pq": PQ, "nmm_pq": NMMPQ, "gem": GEM}
 

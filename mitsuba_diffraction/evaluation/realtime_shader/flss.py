@@ -11,8 +11,8 @@ import numpy as np
 
 from ...errors import RequestError
 from ...surface.heightfield import HeightField
-from .base import Gain, TextureShader
 from .quirks import Quirks
+from .shader import Gain, TextureShader
 
 WINDOWS = ("texel", "4sigma")
 

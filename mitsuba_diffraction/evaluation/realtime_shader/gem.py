@@ -11,10 +11,10 @@ import scipy.fft
 
 from ...errors import RequestError
 from ...surface.heightfield import HeightField
-from .base import Shader, SpectralWeights
 from .quirks import Quirks
+from .shader import Shader, SpectralWeights
 
-ORDERS = 7
+GEM_ORDERS = 7
 _RAINBOW = (0.75, 0.5, 0.25)  # peaks of red, green and blue
 
 
@@ -67,7 +67,7 @@ class GEM(Shader):
         path = dr.abs(wi.x + wo.x) * self.spacing
         highlight = dr.exp(-dr.square(self.roughness * path / dr.maximum(wi.z + wo.z, 1e-6)))
         result = mi.Color3f(highlight)
-        for n in range(1, ORDERS + 1):
+        for n in range(1, GEM_ORDERS + 1):
             y = (path / n - 0.38) / 0.4  # µm
             result += mi.Color3f(*(dr.maximum(1 - dr.square(4 * (y - peak)), 0) for peak in _RAINBOW))
         return dr.select(active, weights.luminance * result, 0)

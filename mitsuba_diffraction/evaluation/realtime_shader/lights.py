@@ -14,7 +14,7 @@ from ...testing import array, interaction
 from .tristimulus import wavelengths
 
 
-def spectrum_of(evaluate: Callable[[mi.SurfaceInteraction3f], mi.UnpolarizedSpectrum]) -> NDArray[np.float64]:
+def sampled_spectrum(evaluate: Callable[[mi.SurfaceInteraction3f], mi.UnpolarizedSpectrum]) -> NDArray[np.float64]:
     """Evaluate a spectral function of a SurfaceInteraction3f at `tristimulus.wavelengths`: (401,)."""
     nanometres, channels = wavelengths(), len(mi.UnpolarizedSpectrum(0))
     groups = np.resize(nanometres, (-(-nanometres.size // channels), channels))
@@ -43,7 +43,7 @@ class Light:
             _, value = emitter.sample_direction(si, mi.Point2f(0.5), True)
             return mi.unpolarized_spectrum(value)
 
-        self.spectrum = spectrum_of(irradiance)
+        self.spectrum = sampled_spectrum(irradiance)
 
     def sample(
         self, si: mi.SurfaceInteraction3f, active: mi.Bool

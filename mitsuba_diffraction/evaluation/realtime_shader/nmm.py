@@ -9,9 +9,9 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from .base import Gain, SpectralWeights, TextureShader, trapezoid
 from .flss import FLSS
-from .tristimulus import MAX_WAVELENGTH, MIN_WAVELENGTH, WAVELENGTH_COUNT, WAVELENGTH_STEP
+from .shader import Gain, SpectralWeights, TextureShader, trapezoid
+from .tristimulus import FIRST_WAVELENGTH, LAST_WAVELENGTH, WAVELENGTH_COUNT, WAVELENGTH_STEP
 
 _MAX_DISTANCE = 4.0  # from the centre of a line, in σ_f: its power is e^{−4²} = 1e-7 of the maximum there
 
@@ -46,7 +46,7 @@ class NMM(FLSS):
         # In units of σ, in which the window is round.
         u, v = gain.u / self.sigmas[0], gain.v / self.sigmas[1]
         slope = dr.sqrt(dr.square(u) + dr.square(v))
-        near = slope * (1e3 / MAX_WAVELENGTH) < _MAX_DISTANCE
+        near = slope * (1e3 / LAST_WAVELENGTH) < _MAX_DISTANCE
         zero = trapezoid(self, self._order_zero, gain, weights, height_scale, gain.active & near)
 
         along_x, path = main_axis(gain, self.tile_size)
@@ -89,7 +89,7 @@ class NMM(FLSS):
 def max_orders(tile_size: tuple[float, float]) -> int:
     """Return the number of λ_n between 380 and 780 nm at |u| = 2."""
     path = 2e3 * max(tile_size)  # nm
-    return int(np.floor(path / MIN_WAVELENGTH) - np.ceil(path / MAX_WAVELENGTH) + 1)
+    return int(np.floor(path / FIRST_WAVELENGTH) - np.ceil(path / LAST_WAVELENGTH) + 1)
 
 
 def main_axis(gain: Gain, tile_size: tuple[float, float]) -> tuple[mi.Bool, mi.Float]:
@@ -109,8 +109,8 @@ def sum_over_orders(
 ) -> mi.Color3f:
     """Return Σ_n F/F₀ weighted_power(n) S (x̄, ȳ, z̄)(λ_n), λ_n = path/n in nm, over the visible wavelengths."""
     result = mi.Color3f(0)
-    n = dr.maximum(mi.Int32(dr.ceil(path / MAX_WAVELENGTH)), 1)
-    last = mi.Int32(dr.floor(path / MIN_WAVELENGTH))
+    n = dr.maximum(mi.Int32(dr.ceil(path / LAST_WAVELENGTH)), 1)
+    last = mi.Int32(dr.floor(path / FIRST_WAVELENGTH))
     while gain.active & (n <= last):
         wavelength, power = weighted_power(n)
         weight, r_0 = weights(wavelength, gain.active)

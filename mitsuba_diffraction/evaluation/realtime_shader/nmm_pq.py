@@ -7,9 +7,9 @@ from typing import ClassVar
 import drjit as dr
 import mitsuba as mi
 
-from .base import Gain, SpectralWeights, trapezoid
 from .nmm import main_axis, max_orders, sum_over_orders
 from .pq import PQ
+from .shader import Gain, SpectralWeights, trapezoid
 from .tristimulus import WAVELENGTH_COUNT, WAVELENGTH_STEP
 
 

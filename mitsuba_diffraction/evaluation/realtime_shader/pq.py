@@ -10,8 +10,8 @@ import mitsuba as mi
 
 from ...errors import RequestError
 from ...surface.heightfield import HeightField
-from .base import Gain, TextureShader
 from .quirks import Quirks
+from .shader import Gain, TextureShader
 
 _AT_INTEGER = 2.0**-13.5  # a quarter of √ε in float32
 

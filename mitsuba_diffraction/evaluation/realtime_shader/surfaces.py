@@ -10,12 +10,12 @@ import drjit as dr
 import mitsuba as mi
 
 from ...bsdf.base import gratings_in, is_grating, parts
-from ...bsdf.geometry import rotated
+from ...bsdf.directions import rotated
 from ...bsdf.layers import Layers
 from ...errors import RequestError
 from ...recipe import Recipe
-from ...rigorous.spectrum import RigorousSpectrum
-from .base import Shader, SpectralWeights
+from ...rigorous.rigorous_spectrum import RigorousSpectrum
+from .shader import Shader, SpectralWeights
 
 _MAX_MASKS = 16  # that a ray passes
 
@@ -49,7 +49,7 @@ def gratings_of(scene: mi.Scene) -> tuple[list[mi.BSDF], list[mi.BSDF]]:
     return gratings, outer
 
 
-def recipe_of(layers: Layers) -> Recipe:
+def recipe_of_layers(layers: Layers) -> Recipe:
     """Return the recipe of a grating, which has its heights.
 
     Raises:

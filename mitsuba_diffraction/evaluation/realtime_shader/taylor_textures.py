@@ -11,13 +11,13 @@ import scipy.fft
 from numpy.typing import NDArray
 from scipy.special import gammaln
 
-from ...bsdf.tables import PacketTable, opaque
+from ...bsdf.device_tables import PacketTable, opaque
 from ...errors import RequestError
 from ...surface.heightfield import HeightField
-from .tristimulus import MIN_WAVELENGTH
+from .tristimulus import FIRST_WAVELENGTH
 
-MAX_KAPPA = 4e3 * np.pi / MIN_WAVELENGTH  # rad/µm, at normal incidence
-MAX_FREQUENCY = 2e3 / MIN_WAVELENGTH  # cycles/µm, at grazing incidence
+MAX_TEXTURE_KAPPA = 4e3 * np.pi / FIRST_WAVELENGTH  # rad/µm, at normal incidence
+MAX_FREQUENCY = 2e3 / FIRST_WAVELENGTH  # cycles/µm, at grazing incidence
 
 
 def terms_for(x: float, error: float) -> int:
@@ -103,7 +103,7 @@ class TaylorTextures:
     def __init__(self, texels: NDArray[np.complex64], height: float) -> None:
         """Store the result of `taylor_transforms`."""
         self.rows, self.columns, self.terms = texels.shape
-        self.error = series_error(MAX_KAPPA * height, self.terms)
+        self.error = series_error(MAX_TEXTURE_KAPPA * height, self.terms)
         self.height = opaque(height)
         self.table = PacketTable(np.stack([texels.real, texels.imag], axis=-1), width=2)
 

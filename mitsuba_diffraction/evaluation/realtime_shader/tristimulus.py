@@ -10,12 +10,12 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from scipy.optimize import lsq_linear
 
-from ...bsdf.tables import PacketTable
+from ...bsdf.device_tables import PacketTable
 from ...color import daylight, matching_functions
 from ...settings import VISIBLE
 from .quirks import Quirks
 
-MIN_WAVELENGTH, MAX_WAVELENGTH, WAVELENGTH_STEP = 380.0, 780.0, 5.0  # nm
+FIRST_WAVELENGTH, LAST_WAVELENGTH, WAVELENGTH_STEP = 380.0, 780.0, 5.0  # nm
 WAVELENGTH_COUNT = 81  # from the shortest to the longest, in such steps
 PUBLISHED_R0 = 0.04  # an index of 1.5, close to that of snake skin
 
@@ -31,7 +31,7 @@ FLAT = 106.857
 
 def wavelengths() -> NDArray[np.float64]:
     """Return the nodes of the tables below, 1 nm apart: (401,), nm."""
-    return np.arange(MIN_WAVELENGTH, MAX_WAVELENGTH + 0.5)
+    return np.arange(FIRST_WAVELENGTH, LAST_WAVELENGTH + 0.5)
 
 
 @lru_cache(maxsize=1)
@@ -83,8 +83,8 @@ class SpectralWeights:
 
     def __call__(self, wavelength: mi.Float, active: mi.Bool) -> tuple[mi.Color3f, mi.Float]:
         """Return (X, Y, Z) per nm, and R₀, at a wavelength in nm; zero outside 380 to 780 nm."""
-        active = active & (wavelength >= MIN_WAVELENGTH - 1e-3) & (wavelength <= MAX_WAVELENGTH + 1e-3)
-        value = interpolated(self.table, wavelength - MIN_WAVELENGTH, int(MAX_WAVELENGTH - MIN_WAVELENGTH), active)
+        active = active & (wavelength >= FIRST_WAVELENGTH - 1e-3) & (wavelength <= LAST_WAVELENGTH + 1e-3)
+        value = interpolated(self.table, wavelength - FIRST_WAVELENGTH, int(LAST_WAVELENGTH - FIRST_WAVELENGTH), active)
         return mi.Color3f(value.x, value.y, value.z), value.w
 
 

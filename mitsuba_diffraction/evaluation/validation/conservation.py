@@ -18,10 +18,10 @@ from .lobes import brdf, grating, spectrum_of
 
 Array = NDArray[np.float64]
 
-WAVELENGTHS = (0.42, 0.55, 0.68)  # µm
-ANGLES = (0.0, 30.0, 60.0, 80.0)  # degrees
-MAX_DEVIATIONS = 4.0  # of averages of random samples
-SAMPLES = 1 << 17
+_WAVELENGTHS = (0.42, 0.55, 0.68)  # µm
+_ANGLES = (0.0, 30.0, 60.0, 80.0)  # degrees
+_MAX_DEVIATIONS = 4.0  # of averages of random samples
+_SAMPLES = 1 << 17
 
 
 def _drawn(bsdf: mi.BSDF, wi: Array, wavelength: float) -> tuple[Array, Array]:
@@ -53,7 +53,7 @@ def reciprocity(spectrum: GratingSpectrum) -> Record:
     """Check f(ω_i, ω_o) = f(ω_o, ω_i), as the ratio of both."""
     bsdf = grating(spectrum, int_ior=1.5)
     forward, reverse = [], []
-    for wavelength in WAVELENGTHS:
+    for wavelength in _WAVELENGTHS:
         wi, wo = _near_orders(spectrum, wavelength, 4000)
         forward.append(brdf(bsdf, wi, wo, wavelength))
         reverse.append(brdf(bsdf, wo, wi, wavelength))
@@ -69,16 +69,16 @@ def energy(spectrum: GratingSpectrum) -> Record:
 def excess(bsdf: mi.BSDF) -> Record:
     """Return the excess over one of the maximum albedo of any BSDF."""
     found = []
-    for wavelength in WAVELENGTHS:
-        for angle in ANGLES:
+    for wavelength in _WAVELENGTHS:
+        for angle in _ANGLES:
             for phi in (0.0, 90.0):
-                wi = np.broadcast_to(testing.direction(angle, phi), (SAMPLES, 3))
+                wi = np.broadcast_to(testing.direction(angle, phi), (_SAMPLES, 3))
                 _, weight = _drawn(bsdf, wi, wavelength)
-                found.append((weight.mean(), weight.std() / np.sqrt(SAMPLES)))
+                found.append((weight.mean(), weight.std() / np.sqrt(_SAMPLES)))
     # argmax returns the first NaN, if there is one.
     max_albedo, error = found[int(np.argmax([mean for mean, _ in found]))]
     note = f"above one; maximum albedo {max_albedo:.5f} of 24 directions and wavelengths"
-    return Record(np.maximum(max_albedo - 1, 0), 0.0, 1e-3 + MAX_DEVIATIONS * error, note=note)
+    return Record(np.maximum(max_albedo - 1, 0), 0.0, 1e-3 + _MAX_DEVIATIONS * error, note=note)
 
 
 _SURFACES = {

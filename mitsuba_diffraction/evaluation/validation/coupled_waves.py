@@ -23,7 +23,7 @@ from numpy.typing import NDArray
 
 from ...scalar_theory import (
     Orders,
-    difference,
+    efficiency_difference,
     error_map,
     expected_error,
     profile_powers,
@@ -49,7 +49,7 @@ def triangular(period: float, depth: float, *, samples: int = 512) -> HeightFiel
     return HeightField(depth * (1 - np.abs(2 * x - 1))[None, :], (period / samples, period), "triangular grating")
 
 
-PROFILES: dict[str, Callable[..., HeightField]] = {
+SOLVED_PROFILES: dict[str, Callable[..., HeightField]] = {
     "sinusoidal": gratings.sinusoidal,
     "blazed": gratings.blazed,
     "triangular": triangular,
@@ -61,7 +61,7 @@ class RigorousResult:
     """One stored result.
 
     Attributes:
-        profile: a name of `PROFILES`.
+        profile: a name of `SOLVED_PROFILES`.
         period, depth, wavelength: µm.
         angle: of incidence, degrees; the light is incident from −x.
         material: "dielectric" (n = 1.5) or a metal by Mitsuba's name.
@@ -102,7 +102,7 @@ class RigorousResult:
 
     def scalar(self) -> Orders:
         """Compute R K G E η_m of this case, in float64."""
-        powers = profile_powers(PROFILES[self.profile](self.period, self.depth))
+        powers = profile_powers(SOLVED_PROFILES[self.profile](self.period, self.depth))
         return scalar_orders(powers, self.period, self.wavelength, self.angle, self.index)
 
     def found(self) -> Array:
@@ -114,14 +114,14 @@ class RigorousResult:
 
 @functools.cache
 def _plugin(profile: str, period: float, depth: float, material: str) -> tuple[Any, Any]:
-    spectrum = spectrum_of(PROFILES[profile](period, depth), coherence_length=200.0, tolerance=1e-4)
+    spectrum = spectrum_of(SOLVED_PROFILES[profile](period, depth), coherence_length=200.0, tolerance=1e-4)
     parameters = {"int_ior": 1.5, "ext_ior": 1.0} if material == "dielectric" else {"material": material}
     return spectrum, grating(spectrum, **parameters)
 
 
 @functools.cache
 def stored() -> dict[str, Any]:
-    """Return the stored rigorous results, as `precompute/rigorous_reference.py` wrote them."""
+    """Return the stored rigorous results, as `tools/data/rigorous_reference.py` wrote them."""
     return json.loads(STORED.read_text(encoding="utf-8"))
 
 
@@ -149,7 +149,7 @@ def _compare(profile: str, choose: Callable[[RigorousResult], bool], metal: bool
     """
     those = [c for c in cases() if c.profile == profile and (c.material != "dielectric") == metal and choose(c)]
     pairs = [(case.scalar().s, case.te) if te else (case.found(), case.unpolarised) for case in those]
-    differences = [difference(*pair) for pair in pairs]
+    differences = [efficiency_difference(*pair) for pair in pairs]
     index = int(np.argmax(differences))
     found, rigorous = pairs[index]
     strongest = int(np.argmax(rigorous))
@@ -164,7 +164,7 @@ def _compare(profile: str, choose: Callable[[RigorousResult], bool], metal: bool
 
 def formula(those: Iterable[RigorousResult]) -> Record:
     """Compare R K G E η_m in float64, on which the map is based, with the BSDF integrated lobe by lobe."""
-    differences = [difference(case.scalar().unpolarised, case.found()) for case in those]
+    differences = [efficiency_difference(case.scalar().unpolarised, case.found()) for case in those]
     # E is read from a table of lower bounds.
     note = f"Σ|Δη|/Σ η, maximum of {len(differences)}; mean {np.mean(differences):.1e}"
     return Record(np.max(differences), 0.0, 2e-2, note=note)
@@ -206,7 +206,7 @@ def _map_against_coupled_waves() -> Record:
     for point in stored()["map"]:
         arguments = point["period"], 1.0, point["angle"]
         scalar = scalar_orders(sinusoid_powers(point["depth"]), *arguments, complex(stored()["map index"]))
-        expected.append(difference(scalar.unpolarised, point["unpolarised"]))
+        expected.append(efficiency_difference(scalar.unpolarised, point["unpolarised"]))
         angle = np.flatnonzero((directions == [point["angle"], 0]).all(axis=1))[0]
         found.append(errors[np.searchsorted(periods, point["period"]), np.searchsorted(depths, point["depth"]), angle])
     return Record.at_max_error(np.array(expected), np.array(found), 0.01, f"{len(found)} sinusoids, 0° and 20°")
@@ -244,7 +244,7 @@ CHECKS = (
         "scalar_theory.py, float64",
         slow=True,
     ),
-    *(check for profile in PROFILES for check in _of_profile(profile)),
+    *(check for profile in SOLVED_PROFILES for check in _of_profile(profile)),
     _check("map against coupled waves", _map_against_coupled_waves),
     _check("map, period ≥ 5 λ, depth ≤ λ/2", lambda: _map(5.0, 0.5, 0.02)),
     _check("map, period ≥ 3.5 λ, depth ≤ λ/5", lambda: _map(3.5, 0.2, 0.02)),

@@ -21,7 +21,7 @@ from ...surface.heightfield import HeightField
 
 Array = NDArray[np.float64]
 
-TOLERANCE = 1e-5
+_TOLERANCE = 1e-5
 """Of the spectra, so that an analytic check to 1e-4 measures the model, not its tables."""
 _QUADRATURE_POINTS = 16
 
@@ -45,18 +45,13 @@ def _built(height_field: HeightField, settings: tuple[tuple[str, Any], ...]) -> 
 
 def spectrum_of(height_field: HeightField, **settings: Any) -> GratingSpectrum:
     """Precompute a spectrum, to 1e-5 by default; cached for the next check of the same surface."""
-    return _built(height_field, tuple(sorted({"tolerance": TOLERANCE, **settings}.items())))
+    return _built(height_field, tuple(sorted({"tolerance": _TOLERANCE, **settings}.items())))
 
 
 def k_g_between(wi: ArrayLike, wo: ArrayLike, shadowing: bool = True) -> Array:
     """Compute K G of unit vectors (..., 3) in the upper hemisphere; shapes broadcast."""
     wi, wo = np.asarray(wi, np.float64), np.asarray(wo, np.float64)
     return k_g(wi[..., 2], wo[..., 2], ((wi + wo)[..., :2] ** 2).sum(axis=-1), shadowing=shadowing)
-
-
-def towards(wi: Array, q: ArrayLike, wavelength: float) -> Array:
-    """Return ω_o (..., 3) of frequencies q (..., 2)."""
-    return testing.towards(wi, q, 1e3 * wavelength)
 
 
 def brdf(bsdf: mi.BSDF, wi: ArrayLike, wo: ArrayLike, wavelength: float) -> Array:
@@ -91,7 +86,7 @@ def lobe_powers(bsdf: mi.BSDF, spectrum: GratingSpectrum, wi: Array, q: ArrayLik
     offset = cutoff * np.stack(np.meshgrid(x, x), axis=-1).reshape(-1, 2)
     points = np.asarray(q, np.float64)[:, None, :] + offset
     area = cutoff**2 * np.outer(weights, weights).ravel()
-    return brdf(bsdf, wi, towards(wi, points, wavelength), wavelength) @ area * wavelength**2
+    return brdf(bsdf, wi, testing.towards(wi, points, 1e3 * wavelength), wavelength) @ area * wavelength**2
 
 
 def orders_above(spectrum: GratingSpectrum, wi: Array, wavelength: float) -> Array:
@@ -102,11 +97,11 @@ def orders_above(spectrum: GratingSpectrum, wi: Array, wavelength: float) -> Arr
     return m[np.hypot(*cosines.T) < np.sin(np.deg2rad(80))]
 
 
-def order_powers(
+def order_powers_of_bsdf(
     bsdf: mi.BSDF, spectrum: GratingSpectrum, wi: Array, m: Array, wavelength: float
 ) -> tuple[Array, Array]:
     """Return η_m (n,) of the orders m (n, 2) by the BSDF (the power of their lobes without K and G), and their κ."""
     q = m / np.asarray(cast(OrderGrid, spectrum.grid).tile_size)
-    wo = towards(wi, q, wavelength)
+    wo = testing.towards(wi, q, 1e3 * wavelength)
     kappa = 2 * np.pi * (wi[2] + wo[:, 2]) / wavelength
     return lobe_powers(bsdf, spectrum, wi, q, wavelength) / k_g_between(wi, wo), kappa

@@ -13,8 +13,9 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from ...rigorous.efficiencies import efficiencies
+from ...rigorous.solver import efficiencies
 from ...scalar_theory import profile_powers, scalar_orders
+from ...settings import THEORIES
 from ...surface.gratings import right_angled
 from ..record import Check, Record
 
@@ -23,7 +24,6 @@ Real = NDArray[np.float64]
 DATA = Path(__file__).parents[2] / "data" / "gratings"
 FITS = DATA / "fits.json"
 LINES_PER_MM = {"R150": 150.0, "R400": 400.0, "B600": 600.0, "R831": 831.0}
-THEORIES = ("scalar", "rigorous")
 
 MAX_RMS_DIFFERENCE = 0.05
 """Of rigorous theory; R150 exceeds it: see docs/validation.md."""
@@ -84,7 +84,7 @@ def measured(name: str) -> tuple[Real, Real]:
 
 @functools.cache
 def stored_angles() -> dict[str, dict[str, float]]:
-    """Return ruled grating, or grooves of T300 → theory → fitted angle in degrees (`precompute/ruled_fits.py`)."""
+    """Return ruled grating, or grooves of T300 → theory → fitted angle in degrees (`tools/data/ruled_fits.py`)."""
     stored = json.loads(FITS.read_text(encoding="utf-8"))
     return {**stored["facet angles"], **stored["groove angles"]}
 
@@ -99,7 +99,7 @@ def best_factor(found: Real, wanted: Real) -> float:
     return float(found @ wanted / (found @ found))
 
 
-def difference(name: str, theory: str) -> Record:
+def rms_from_measured(name: str, theory: str) -> Record:
     """Compute the root mean square difference from the measured efficiencies."""
     wavelengths, wanted = measured(name)
     angle = stored_angles()[name][theory]
@@ -117,7 +117,7 @@ CHECKS = tuple(
     Check(
         "literature",
         f"{name}, {lines:g} lines/mm, measured: {theory} theory",
-        functools.partial(difference, name, theory),
+        functools.partial(rms_from_measured, name, theory),
         "data/gratings/README.md",
     )
     for name, lines in LINES_PER_MM.items()

@@ -27,9 +27,9 @@ from scipy.special import gammaln, ndtr
 from ...grating_spectrum import GratingSpectrum
 from ...settings import lobe_width
 from ...surface.heightfield import HeightField
-from ...testing import direction
+from ...testing import direction, towards
 from ..record import Check, Record
-from .lobes import brdf, density, grating, spectrum_of, towards
+from .lobes import brdf, density, grating, spectrum_of
 
 Array = NDArray[np.float64]
 
@@ -39,7 +39,7 @@ SETTINGS = {"largest_angle": 41.5}
 SMALL_ROUGHNESS = (0.06, 0.8)  # rms height and correlation length, µm
 LARGE_ROUGHNESS = (0.2, 2.7)
 COHERENCE_LENGTH = 20.0  # µm
-MAX_DEVIATIONS = 3.0  # standard deviations allowed
+_MAX_DEVIATIONS = 3.0  # standard deviations allowed
 
 
 def random_profile(rms: float, correlation: float) -> HeightField:
@@ -79,13 +79,15 @@ def _coherent(wavelength: float, angle: float) -> Record:
     axis = np.linspace(-5, 5, 51) * sigma
     step = axis[1] - axis[0]
     q = np.stack(np.meshgrid(axis, axis), axis=-1)
-    found = density(grating(spectrum, conserve=False), wi, towards(wi, q, wavelength), wavelength).sum() * step**2
+    found = density(grating(spectrum, conserve=False), wi, towards(wi, q, 1e3 * wavelength), wavelength).sum() * step**2
     near = diffuse(axis, g, correlation, sigma).sum() * step
     noise = np.hypot(
         2 * np.exp(-g / 2) * np.sqrt(diffuse(np.zeros(1), g, correlation, even=True)[0] / PROFILE_LENGTH),
         near / np.sqrt(PROFILE_LENGTH * 10 * sigma),
     )
-    return Record(found - near, np.exp(-g), MAX_DEVIATIONS * noise + spectrum.tolerance, note=f"κσ = {kappa * rms:.2f}")
+    return Record(
+        found - near, np.exp(-g), _MAX_DEVIATIONS * noise + spectrum.tolerance, note=f"κσ = {kappa * rms:.2f}"
+    )
 
 
 def _diffuse_bands() -> Record:
@@ -102,7 +104,7 @@ def _diffuse_bands() -> Record:
     for low, high in itertools.pairwise(edges):
         x = (np.arange(40) + 0.5) / 40 * (high - low) + low
         q = np.stack(np.meshgrid(np.concatenate([-x, x]), y), axis=-1)
-        wo = towards(wi, q, wavelength)
+        wo = towards(wi, q, 1e3 * wavelength)
         kappa = 2 * np.pi * (1 + wo[..., 2]) / wavelength
         # κ decreases with the angle: the series is evaluated with κ of each point.
         series = np.vectorize(lambda a, k: diffuse(a, (k * rms) ** 2, correlation, sigma))
@@ -110,7 +112,7 @@ def _diffuse_bands() -> Record:
         expected.append((series(q[..., 0], kappa) * np.exp(-((q[..., 1] / sigma) ** 2) / 2)).sum() * area)
         expected[-1] /= np.sqrt(2 * np.pi) * sigma
         found.append(density(bsdf, wi, wo, wavelength).sum() * area)
-        bounds.append(MAX_DEVIATIONS * expected[-1] / np.sqrt(PROFILE_LENGTH * 2 * (high - low)) + spectrum.tolerance)
+        bounds.append(_MAX_DEVIATIONS * expected[-1] / np.sqrt(PROFILE_LENGTH * 2 * (high - low)) + spectrum.tolerance)
     return Record.at_max_error(expected, found, bounds, f"maximum of {len(found)} bands, g = {g:.2f}")
 
 
@@ -151,7 +153,7 @@ def _microfacets(angle: float) -> Record:
         probability = ndtr(high / broadened) - ndtr(low / broadened)
         speckles = PROFILE_LENGTH * (high - low) * w / wavelength
         noise = np.hypot(np.sqrt((1 - probability) / probability * correlation / PROFILE_LENGTH), 1 / np.sqrt(speckles))
-        bounds.append(MAX_DEVIATIONS * noise)
+        bounds.append(_MAX_DEVIATIONS * noise)
     note = f"f [1/sr]; relative; κσ = {2 * np.pi * w / wavelength * rms:.0f}; maximum of {len(found)} bands of slope"
     return Record.at_max_error(expected, found, bounds, note, relative=True)
 

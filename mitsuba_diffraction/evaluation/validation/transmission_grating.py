@@ -13,18 +13,19 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ...geometry import fresnel
-from ...rigorous.efficiencies import efficiencies
+from ...rigorous.solver import efficiencies
 from ...scalar_theory import profile_powers, transmitted_orders
+from ...settings import THEORIES
 from ...surface.gratings import blazed, right_angled
 from ...surface.heightfield import HeightField
 from ..record import Check, Record
-from .measured_gratings import THEORIES, best_factor, measured, rms_difference, stored_angles
+from .measured_gratings import best_factor, measured, rms_difference, stored_angles
 
 Real = NDArray[np.float64]
 
-PERIOD = 1000 / 300
+T300_PERIOD = 1000 / 300
 GROOVES = ("right-angled", "vertical wall")
-MAX_RMS_DIFFERENCE = 0.02
+MAX_T300_RMS_DIFFERENCE = 0.02
 """Of rigorous theory."""
 
 # λ in µm → second order over first, from spectra of stars.
@@ -40,8 +41,8 @@ def b270(wavelength: float) -> float:
 def groove(shape: str, angle: float) -> HeightField:
     """Return one period of grooves with facets of this angle in degrees, and a wall at 90° to them or vertical."""
     if shape == "right-angled":
-        return right_angled(PERIOD, angle)
-    return blazed(PERIOD, PERIOD * np.tan(np.deg2rad(angle)), samples=512)
+        return right_angled(T300_PERIOD, angle)
+    return blazed(T300_PERIOD, T300_PERIOD * np.tan(np.deg2rad(angle)), samples=512)
 
 
 def transmitted(surface: HeightField, wavelength: float, rigorous: bool) -> Real:
@@ -49,11 +50,11 @@ def transmitted(surface: HeightField, wavelength: float, rigorous: bool) -> Real
     index = b270(wavelength)
     if rigorous:
         # Fifteen harmonics more change the efficiencies by less than 1e-3.
-        harmonics = int(2 * index * PERIOD / wavelength) + 15
+        harmonics = int(2 * index * T300_PERIOD / wavelength) + 15
         exact = efficiencies(surface, (0, 0, -1), wavelength, int_ior=index, tolerance=0.02, harmonics=harmonics)
         orders, powers = exact.transmitted_orders, exact.transmitted_unpolarised
     else:
-        scalar = transmitted_orders(profile_powers(surface), PERIOD, wavelength, 0.0, index, from_below=True)
+        scalar = transmitted_orders(profile_powers(surface), T300_PERIOD, wavelength, 0.0, index, from_below=True)
         orders, powers = scalar.m, scalar.unpolarised
     face = 1 - fresnel(1.0, index)[0]
     return face * np.array([powers[orders == -m][0] for m in (1, 2)])
@@ -73,14 +74,14 @@ def scaled(found: Real, step: int = 1) -> tuple[float, float]:
     return factor, rms_difference(factor * found, wanted)
 
 
-def difference(shape: str, theory: str) -> Record:
+def t300_difference(shape: str, theory: str) -> Record:
     """Return the root of the mean square difference to the measured efficiencies, both scaled by the best factor."""
     angle = stored_angles()[shape][theory]
     found = curve(shape, angle, theory == "rigorous")
     factor, rms = scaled(found)
     raw = rms_difference(found, measured("T300")[1])
     note = f"rms over {len(found)} wavelengths, facets of {angle:.2f}°, all scaled by {factor:.3f}; {raw:.3f} unscaled"
-    return Record(rms, 0.0, MAX_RMS_DIFFERENCE if theory == "rigorous" else None, note=note)
+    return Record(rms, 0.0, MAX_T300_RMS_DIFFERENCE if theory == "rigorous" else None, note=note)
 
 
 def ratios(shape: str, theory: str) -> Record:
@@ -106,7 +107,7 @@ CHECKS = tuple(
     for shape in GROOVES
     for theory in THEORIES
     for what, measure, source in (
-        ("order 1,", difference, "data/gratings/README.md"),
+        ("order 1,", t300_difference, "data/gratings/README.md"),
         ("order 2 over 1,", ratios, "estimate from star spectra"),
     )
 )

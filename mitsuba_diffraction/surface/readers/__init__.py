@@ -19,18 +19,18 @@ from ...errors import RequestError, is_number
 from ...files import refuse_special
 from ...settings import Settings
 from ..heightfield import HeightField
-from . import gwyddion, instruments, interferometers, mended, pictures, text
+from . import gwyddion, images, instruments, interferometers, mended, text
 from .scan import Scan, micrometres, pair
 
 __all__ = ["read_height_field"]
 
 _MAX_QUOTE = 300  # characters of a library's error message, as some quote a damaged header in full
 _WITHOUT_UNIT = {
-    ".npy": pictures.read_npy,
-    ".npz": pictures.read_npz,
-    ".png": pictures.read,
-    ".tif": pictures.read,
-    ".tiff": pictures.read,
+    ".npy": images.read_npy,
+    ".npz": images.read_npz,
+    ".png": images.read_image,
+    ".tif": images.read_image,
+    ".tiff": images.read_image,
 }
 """Extension → reader of formats with heights in µm, or scaled by `height_range`."""
 
@@ -182,7 +182,7 @@ def _read(path: Path, channel: str | int | None, unit: str | tuple[str, str] | N
     known = extension in _EXTENSIONS or instruments.format_of(extension) is not None
     if (not known or extension in _OF_MANY_PROGRAMS) and path.is_file():
         extension = _extension_of_content(path)
-    if extension in (".tif", ".tiff") and (tag := pictures.private_tag(path, instruments.PRIVATE_TIFF)):
+    if extension in (".tif", ".tiff") and (tag := images.private_tag(path, instruments.PRIVATE_TIFF)):
         extension = instruments.PRIVATE_TIFF[tag]
     instrument = instruments.format_of(extension) is not None
     if extension not in _EXTENSIONS and not instrument:
@@ -195,9 +195,9 @@ def _read(path: Path, channel: str | int | None, unit: str | tuple[str, str] | N
     if channel is not None and not (instrument or extension == ".gwy"):
         raise RequestError(f"channel: got {channel!r} for {extension}, which holds one only")
     if instrument:
-        return instruments.read(path, unit, channel, extension)
+        return instruments.read_instrument(path, unit, channel, extension)
     if extension == ".gwy":
-        return gwyddion.read(path, unit, channel)
+        return gwyddion.read_gwyddion(path, unit, channel)
     if extension in _WITH_UNIT:
         return _WITH_UNIT[extension](path, unit)
     read = _WITHOUT_UNIT[extension](path)

@@ -24,7 +24,7 @@ from numpy.typing import NDArray
 
 from ...errors import RequestError
 from . import scan
-from .scan import MAX_BYTES, Channel, Scan, choose
+from .scan import MAX_ARRAY_BYTES, Channel, Scan, choose_channel
 
 _NUMBERS = {"b": "<B", "c": "<B", "i": "<i", "q": "<q", "d": "<d"}
 _ARRAYS = {"C": 1, "I": 4, "Q": 8, "D": 8}  # bytes of an element
@@ -36,10 +36,10 @@ _SIMPLE = b"Gwyddion Simple Field 1.0\n"
 _MAX_HEADER_LENGTH = 2**20
 
 
-def read(path: Path, unit: str | tuple[str, str] | None, channel: str | int | None) -> Scan:
+def read_gwyddion(path: Path, unit: str | tuple[str, str] | None, channel: str | int | None) -> Scan:
     """Read one data field of a .gwy file; the top row of its image is row 0. Masks are ignored."""
-    if path.stat().st_size > MAX_BYTES:
-        raise RequestError(f"got {path.stat().st_size} bytes, wanted at most {MAX_BYTES}")
+    if path.stat().st_size > MAX_ARRAY_BYTES:
+        raise RequestError(f"got {path.stat().st_size} bytes, wanted at most {MAX_ARRAY_BYTES}")
     data = path.read_bytes()
     if data[:4] == b"GWYQ":
         raise RequestError("a Gwyddion file with sizes of 64 bits ('GWYQ'): save it as .gwy of Gwyddion 2, or as .gsf")
@@ -57,7 +57,7 @@ def read(path: Path, unit: str | tuple[str, str] | None, channel: str | int | No
             titles[int(match[1])] = value
     units = {n: _unit(field, "si_unit_z") for n, field in fields.items()}
     channels = [Channel(n, titles.get(n, "untitled"), scan.is_length(z) or not z) for n, z in sorted(units.items())]
-    chosen = choose(channels, channel)
+    chosen = choose_channel(channels, channel)
     field, (given_along, given_high) = fields[chosen.number], scan.pair(unit)
     high = scan.scale(units[chosen.number], given_high, "the heights")
     along = scan.scale(_unit(field, "si_unit_xy"), given_along, "the width")
@@ -162,8 +162,8 @@ def read_simple_field(path: Path, unit: str | tuple[str, str] | None) -> Scan:
             raise RequestError("the header does not end: a truncated file")
         fields = _fields(head[len(_SIMPLE) : end])
         columns, rows = (_count(fields, name) for name in ("XRes", "YRes"))
-        if 4 * rows * columns > MAX_BYTES:
-            raise RequestError(f"got {columns} × {rows} pixels, wanted at most {MAX_BYTES} bytes")
+        if 4 * rows * columns > MAX_ARRAY_BYTES:
+            raise RequestError(f"got {columns} × {rows} pixels, wanted at most {MAX_ARRAY_BYTES} bytes")
         start = end + 4 - end % 4
         size = path.stat().st_size
         if size != start + 4 * rows * columns:

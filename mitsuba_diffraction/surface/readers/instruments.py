@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 
 from ...errors import RequestError
 from . import mended, scan
-from .scan import MAX_BYTES, Channel, Scan, choose
+from .scan import MAX_ARRAY_BYTES, Channel, Scan, choose_channel
 
 EXTRA = "pip install 'mitsuba_diffraction[instruments]'"
 
@@ -49,7 +49,7 @@ def format_of(extension: str) -> str | None:
     return "di" if re.fullmatch(r"\.\d{3}", extension) else FORMATS.get(extension)
 
 
-def read(path: Path, unit: str | tuple[str, str] | None, channel: str | int | None, extension: str) -> Scan:
+def read_instrument(path: Path, unit: str | tuple[str, str] | None, channel: str | int | None, extension: str) -> Scan:
     """Read one channel of an instrument file of that extension; the top row of its image is row 0."""
     with warnings.catch_warnings(), _quiet():
         warnings.simplefilter("ignore")  # of the library, on optional dependencies and metadata
@@ -64,7 +64,7 @@ def read(path: Path, unit: str | tuple[str, str] | None, channel: str | int | No
         contents, doubts = mended.rewritten(path, name)
         try:
             found = {c.index: c for c in library(contents).channels}
-            chosen = choose(
+            chosen = choose_channel(
                 [
                     Channel(number, c.name or "untitled", c.dim == 2 and c.data_kind.value == "height")
                     for number, c in found.items()
@@ -72,8 +72,8 @@ def read(path: Path, unit: str | tuple[str, str] | None, channel: str | int | No
                 channel,
             )
             source = found[chosen.number]
-            if 8 * int(np.prod(source.nb_grid_pts, dtype=object)) > MAX_BYTES:
-                raise RequestError(f"got {source.nb_grid_pts} pixels, wanted at most {MAX_BYTES} bytes")
+            if 8 * int(np.prod(source.nb_grid_pts, dtype=object)) > MAX_ARRAY_BYTES:
+                raise RequestError(f"got {source.nb_grid_pts} pixels, wanted at most {MAX_ARRAY_BYTES} bytes")
             given, own = scan.pair(unit), source.unit or ""
             along, high = (scan.scale(own, one, "its lengths") for one in given)
             if name == "ibw" and not mended.ibw_has_unit(contents):
@@ -126,5 +126,5 @@ def _refuse_bomb(path: Path) -> None:
                 unpacked = sum(member.file_size for member in archive.infolist())
         except (zipfile.BadZipFile, ValueError, NotImplementedError) as error:
             raise RequestError(f"a damaged archive ({error})") from None
-        if unpacked > MAX_BYTES:
-            raise RequestError(f"an archive of {unpacked} bytes, wanted at most {MAX_BYTES}")
+        if unpacked > MAX_ARRAY_BYTES:
+            raise RequestError(f"an archive of {unpacked} bytes, wanted at most {MAX_ARRAY_BYTES}")

@@ -51,7 +51,7 @@ def read_wyko(path: Path, unit: str | tuple[str, str] | None) -> Scan:
     else:
         raise RequestError(f"a Wyko ASCII file without heights, wanted a block {', '.join(_HEIGHTS)}")
     columns, rows = (int(_number(fields, name)) for name in ("X Size", "Y Size"))
-    heights = text.table("\n".join(lines[at : at + columns]).replace("Bad", "nan"))
+    heights = text.parse_table("\n".join(lines[at : at + columns]).replace("Bad", "nan"))
     if heights.shape != (columns, rows):
         raise RequestError(f"got {heights.shape[0]} lines of {heights.shape[1]} heights, wanted {columns} of {rows}")
     if first.split("\t")[1:2] in ([], ["0"]):
@@ -82,7 +82,7 @@ def read_zygo(path: Path, unit: str | tuple[str, str] | None) -> Scan:
             f"lines 4 and 8 of a Zygo XYZ file: got {lines[2][:60]!r} and {lines[6][:60]!r}, wanted 4 and 8 numbers"
         ) from None
     end = marks[1] if len(marks) > 1 else len(lines)
-    points = text.table("\n".join(lines[marks[0] + 1 : end]).replace("No Data", "nan"))
+    points = text.parse_table("\n".join(lines[marks[0] + 1 : end]).replace("No Data", "nan"))
     if len(points) != columns * rows:
         raise RequestError(f"got {len(points)} points, wanted {columns} × {rows}")
     heights, (d_x, d_y) = text.gridded(points)

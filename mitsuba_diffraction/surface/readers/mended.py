@@ -31,7 +31,7 @@ from numpy.typing import NDArray
 
 from ...errors import RequestError
 from . import nanoscope
-from .scan import MAX_BYTES
+from .scan import MAX_ARRAY_BYTES
 
 _TMD_COMMENT = 24  # bytes, of the only comment that the library reads
 _SUR_HEADER, _SUR_SIZES = 512, struct.Struct("<2h")  # lengths of comment and private data, at `_SUR_AT`
@@ -53,10 +53,10 @@ def rewritten(path: Path, name: str) -> tuple[str | io.BytesIO, list[str]]:
         return io.BytesIO(_jpk_image(path)), []
     if name not in (*_REWRITE, "di"):
         return str(path), []
-    if path.stat().st_size > MAX_BYTES:
-        raise RequestError(f"got {path.stat().st_size} bytes, wanted at most {MAX_BYTES}")
+    if path.stat().st_size > MAX_ARRAY_BYTES:
+        raise RequestError(f"got {path.stat().st_size} bytes, wanted at most {MAX_ARRAY_BYTES}")
     data = path.read_bytes()
-    data, doubts = nanoscope.rewritten(data) if name == "di" else (_REWRITE[name](data), [])
+    data, doubts = nanoscope.rewritten_nanoscope(data) if name == "di" else (_REWRITE[name](data), [])
     return io.BytesIO(data), doubts
 
 
@@ -76,8 +76,8 @@ def _jpk_image(path: Path) -> bytes:
                     f"an archive without an image of the heights ({' or '.join(_JPK_IMAGES)}): save that image with "
                     "JPK's program, as .jpk or .jpk-qi-image"
                 )
-            if image.file_size > MAX_BYTES:
-                raise RequestError(f"got an image of {image.file_size} bytes, wanted at most {MAX_BYTES}")
+            if image.file_size > MAX_ARRAY_BYTES:
+                raise RequestError(f"got an image of {image.file_size} bytes, wanted at most {MAX_ARRAY_BYTES}")
             return archive.read(image)
     except (zipfile.BadZipFile, NotImplementedError, RuntimeError, EOFError, zlib.error) as error:
         raise RequestError(f"a damaged archive ({error})") from None
@@ -99,8 +99,8 @@ def _sur(data: bytes) -> bytes:
         (count,) = struct.unpack_from("<I", data, start)
         sizes = struct.unpack_from(f"<{2 * count}I", data, start + 4)
         begin, streams = start + 4 + 8 * count, []
-        if sum(sizes[::2]) > MAX_BYTES:
-            raise RequestError(f"got {sum(sizes[::2])} bytes of heights, wanted at most {MAX_BYTES}")
+        if sum(sizes[::2]) > MAX_ARRAY_BYTES:
+            raise RequestError(f"got {sum(sizes[::2])} bytes of heights, wanted at most {MAX_ARRAY_BYTES}")
         for raw, packed in zip(sizes[::2], sizes[1::2], strict=True):
             streams.append(zlib.decompressobj().decompress(data[begin : begin + packed], raw))
             begin += packed

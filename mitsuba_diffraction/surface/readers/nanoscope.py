@@ -27,7 +27,7 @@ class _Image(NamedTuple):
     doubt: str
 
 
-def rewritten(data: bytes) -> tuple[bytes, list[str]]:
+def rewritten_nanoscope(data: bytes) -> tuple[bytes, list[str]]:
     """Return a file whose image sections have the right lines and sizes, and `Scan.doubt` of each image."""
     if (end := _END.search(data)) is None:
         return data, []

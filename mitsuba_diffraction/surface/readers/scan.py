@@ -68,7 +68,7 @@ def decoded(content: bytes) -> str:
         return content.decode("latin-1")
 
 
-MAX_BYTES = 2**31  # of an array read from a file
+MAX_ARRAY_BYTES = 2**31  # of an array read from a file
 # Raised by Pillow and NumPy for damaged files, in addition to OSError and ValueError.
 DAMAGED = (SyntaxError, TypeError, KeyError, EOFError, IndexError, OverflowError, struct.error, UserWarning)
 # Names of the height channel in instrument files.
@@ -106,7 +106,7 @@ class Channel:
         return f"{self.number} {self.name!r}"
 
 
-def choose(channels: Sequence[Channel], wanted: str | int | None) -> Channel:
+def choose_channel(channels: Sequence[Channel], wanted: str | int | None) -> Channel:
     """Return the named channel, or the channel of the heights.
 
     Args:

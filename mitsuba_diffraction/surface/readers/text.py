@@ -36,7 +36,7 @@ from numpy.typing import NDArray
 
 from ...errors import RequestError
 from . import scan
-from .scan import MAX_BYTES, Scan
+from .scan import MAX_ARRAY_BYTES, Scan
 
 _MAX_GRID_DEVIATION = 0.1  # of a coordinate, in pixels, owing to rounding in text
 _MIN_POINT_FRACTION = 0.25  # of grid positions that have a point
@@ -51,7 +51,7 @@ _ESRI = ("ncols", "nrows", "xllcorner", "yllcorner", "xllcenter", "yllcenter", "
 
 def read_points(path: Path, unit: str | tuple[str, str] | None) -> Scan:
     """Read points x y z on a regular grid."""
-    return _points(table(contents(path)), unit)
+    return _points(parse_table(contents(path)), unit)
 
 
 def _points(points: NDArray[np.float64], unit: str | tuple[str, str] | None) -> Scan:
@@ -91,7 +91,7 @@ def read_csv(path: Path, unit: str | tuple[str, str] | None) -> Scan:
         units = [match[1].strip() for name in names if (match := _BRACKETS.search(name))]
         if len(units) == len(names) and len({*units[:2]}) == 1:
             unit = units[0], units[-1]
-    numbers = table(text)
+    numbers = parse_table(text)
     return _points(numbers, unit) if numbers.shape[1] == 3 and _may_be_points(numbers) else _heights(text, unit)
 
 
@@ -104,7 +104,7 @@ def _heights(text: str, unit: str | tuple[str, str] | None) -> Scan:
     if text.lstrip()[:5].lower() == "ncols":
         return _esri(text, unit)
     header = _gwyddion_header(text)
-    heights = table(text)
+    heights = parse_table(text)
     rows, columns = heights.shape
     if not header and columns == 3 and _may_be_points(heights):
         raise RequestError("three numbers a line that may be points x y z: wanted the extension .xyz for points")
@@ -156,7 +156,7 @@ def _esri(text: str, unit: str | tuple[str, str] | None) -> Scan:
     if not {"ncols", "nrows", "cellsize"} <= header.keys():
         raise RequestError(f"the header of an ESRI grid: got {', '.join(header)}, wanted ncols, nrows and cellsize")
     along, high = (scan.scale("", given, "its lengths") for given in scan.pair(unit))
-    heights = table("\n".join(lines[len(header) :]))
+    heights = parse_table("\n".join(lines[len(header) :]))
     if heights.shape != (header["nrows"], header["ncols"]):
         raise RequestError(
             f"got {heights.shape[0]} lines of {heights.shape[1]}, wanted {header['nrows']:g} of {header['ncols']:g}"
@@ -168,15 +168,15 @@ def _esri(text: str, unit: str | tuple[str, str] | None) -> Scan:
 
 def contents(path: Path) -> str:
     """Return a text in UTF-8 or Latin-1, whose lines end with \\n."""
-    if path.stat().st_size > MAX_BYTES:
-        raise RequestError(f"got {path.stat().st_size} bytes, wanted at most {MAX_BYTES}")
+    if path.stat().st_size > MAX_ARRAY_BYTES:
+        raise RequestError(f"got {path.stat().st_size} bytes, wanted at most {MAX_ARRAY_BYTES}")
     text = scan.decoded(path.read_bytes()).replace("\r\n", "\n").replace("\r", "\n")
     if "\0" in text:
         raise RequestError("not a text: it holds zero bytes")
     return text
 
 
-def table(text: str) -> NDArray[np.float64]:
+def parse_table(text: str) -> NDArray[np.float64]:
     """Parse numbers in lines of equal length, separated by white space, commas or semicolons."""
     first = next((line for line in text.splitlines() if line.strip() and not line.lstrip().startswith("#")), "")
     if not first:
@@ -193,7 +193,7 @@ def table(text: str) -> NDArray[np.float64]:
         if len(numbers) > 1 and "," in text and "." not in re.sub("#.*", "", text):
             # Commas are decimal, but the first line has whole numbers, too.
             with suppress(RequestError):
-                return table(text.translate(point))
+                return parse_table(text.translate(point))
         raise RequestError(f"not a table of numbers ({error})") from None
 
 

@@ -1,0 +1,152 @@
+"""Heights as arrays: NumPy files (pickles are never loaded) and greyscale pictures."""
+
+from __future__ import annotations
+
+import re
+import tokenize
+import warnings
+import zipfile
+import zlib
+from collections.abc import Iterable
+from contextlib import suppress
+from pathlib import Path
+from typing import IO
+
+import numpy as np
+from numpy.typing import NDArray
+from PIL import Image, UnidentifiedImageError
+
+from ...errors import RequestError
+from ...outputs import MARK
+from .scan import DAMAGED, MAX_ARRAY_BYTES, Scan
+
+
+def read_npy(path: Path) -> Scan:
+    """Read the array of a file."""
+    with path.open("rb") as file:
+        return Scan(_load_array(file))
+
+
+def read_npz(path: Path) -> Scan:
+    """Read the array `heights` of an archive, and its `pixel_size`, if any."""
+    try:
+        with zipfile.ZipFile(path) as archive:
+            unpacked = max((member.file_size for member in archive.infolist()), default=0)
+            if unpacked > MAX_ARRAY_BYTES:
+                raise RequestError(f"got an array of {unpacked} bytes, wanted at most {MAX_ARRAY_BYTES}")
+            names = [name.removesuffix(".npy") for name in archive.namelist()]
+            if "heights" not in names:
+                raise RequestError(f"got the arrays {names}, wanted 'heights' and optionally 'pixel_size'")
+            with archive.open("heights.npy") as file:
+                heights = _load_array(file)
+            if "pixel_size" not in names:
+                return Scan(heights)
+            with archive.open("pixel_size.npy") as file:
+                pixel_size = _load_array(file)
+    except RequestError:
+        raise
+    except (zipfile.BadZipFile, EOFError, KeyError, NotImplementedError, RuntimeError, ValueError, zlib.error) as error:
+        raise RequestError(f"not a whole .npz archive ({error})") from None
+    if pixel_size.dtype.kind not in "iuf" or pixel_size.shape not in ((), (1,), (2,)):
+        raise RequestError(
+            f"pixel_size: got an array of type {pixel_size.dtype} and shape {pixel_size.shape}, "
+            "wanted one number or (x, y) in µm"
+        )
+    x, y = np.broadcast_to(pixel_size, 2).tolist()
+    return Scan(heights, (float(x), float(y)))
+
+
+def _load_array(file: IO[bytes]) -> NDArray:
+    """Read an array in NumPy's format; pickles are refused."""
+    try:
+        with warnings.catch_warnings():
+            warnings.simplefilter("error", UserWarning)
+            return np.lib.format.read_array(file, allow_pickle=False)
+    except (*DAMAGED, ValueError, MemoryError, tokenize.TokenError) as error:
+        raise RequestError(f"not an array that can be read ({error})") from None
+
+
+_HEIGHT_RANGE = re.compile(r"^height_range_um=(\d+\.?\d*(?:e[-+]?\d+)?)$", re.MULTILINE)
+MAX_ANNOTATION_FRACTION = 0.25  # of pixels that are coloured, such as a scale bar; a colour map has more
+
+
+def private_tag(path: Path, tags: Iterable[int]) -> int | None:
+    """Return which of these tags a TIFF has, None if it has none of them."""
+    with warnings.catch_warnings(), suppress(*DAMAGED, ValueError, OSError, Image.DecompressionBombError):
+        warnings.simplefilter("ignore")  # `read_image` refuses what is too large
+        with Image.open(path, formats=("TIFF",)) as picture:
+            return next((tag for tag in tags if tag in picture.tag_v2), None)
+    return None
+
+
+def read_image(path: Path) -> Scan:
+    """Read the channel of an image."""
+    with warnings.catch_warnings():
+        # Warnings of Pillow (decompression bombs, damaged metadata) are errors here.
+        warnings.simplefilter("error", Image.DecompressionBombWarning)
+        warnings.simplefilter("error", UserWarning)
+        try:
+            with Image.open(path, formats=("PNG", "TIFF")) as picture:
+                pages = getattr(picture, "n_frames", 1)
+                if pages != 1:
+                    raise RequestError(f"got {pages} pages or frames, wanted one")
+                pixel_size, height_range = _own_scale(picture)
+                return Scan(_numbers_of(picture), pixel_size, height_range=height_range)
+        except UnidentifiedImageError:
+            raise RequestError("not a PNG or TIFF picture that can be read") from None
+        except (Image.DecompressionBombError, Image.DecompressionBombWarning) as error:
+            raise RequestError(
+                f"too large, wanted at most {Image.MAX_IMAGE_PIXELS} pixels: crop it, or export .npy, .gsf or .gwy "
+                f"({error})"
+            ) from None
+        except RequestError:
+            raise
+        except (*DAMAGED, ValueError) as error:
+            raise RequestError(f"a damaged picture ({type(error).__name__}: {error})") from None
+
+
+def _own_scale(picture: Image.Image) -> tuple[tuple[float, float] | None, float | None]:
+    """Return pixel size and height range, µm, of a TIFF that this package wrote (`inverse_design/output.py`)."""
+    if picture.format != "TIFF" or picture.tag_v2.get(305) != MARK:
+        return None, None
+    found = _HEIGHT_RANGE.search(str(picture.tag_v2.get(270, "")))
+    resolution = [float(picture.tag_v2.get(tag, 0)) for tag in (282, 283)]
+    if found is None or picture.tag_v2.get(296) != 3 or min(resolution) <= 0:
+        return None, None
+    # Pixels per cm.
+    return (1e4 / resolution[0], 1e4 / resolution[1]), float(found[1])
+
+
+def _numbers_of(picture: Image.Image) -> NDArray:
+    """Return the channel of a greyscale image in its own precision: uint8, uint16 or float32."""
+    mode = picture.mode
+    # The pixel format of the file, which Pillow discards on loading.
+    packing = str(picture.tile[0][3]) if picture.tile else ""
+    white_is_zero = picture.format == "TIFF" and picture.tag_v2.get(262) == 0
+    sixteen = mode.startswith("I;16") and "I;16" in packing and not white_is_zero
+    # Older versions of Pillow open 16 bit PNG files as 32 bit integers.
+    sixteen = sixteen or (mode == "I" and picture.format == "PNG")
+    channels = mode in ("RGB", "RGBA", "LA") and ";16" not in packing
+    if not (mode in ("L", "F") or sixteen or channels) or "transparency" in picture.info:
+        raise RequestError(
+            f"got a picture of Pillow mode {mode!r} ({packing}), wanted opaque grey of 8 or 16 bit, black at zero, "
+            "or (TIFF) 32 bit float"
+        )
+    pixels = np.asarray(picture)
+    if channels:
+        return _grey(pixels, mode)
+    return pixels.astype(np.uint16) if sixteen else pixels
+
+
+def _grey(pixels: NDArray, mode: str) -> NDArray:
+    """Return the common channel of a colour image that is grey and opaque; coloured annotation on it is masked."""
+    if mode.endswith("A") and not (pixels[..., -1] == 255).all():
+        raise RequestError("got a picture with transparent pixels, wanted an opaque grey one")
+    colours = pixels[..., : len(mode.removesuffix("A"))]
+    coloured = (colours != colours[..., :1]).any(axis=-1)
+    if coloured.mean() > MAX_ANNOTATION_FRACTION:
+        raise RequestError(
+            "got a colour picture, wanted a grey one: colours of a map are no heights; export the data itself (.gwy, "
+            ".gsf, a .tif of 32 bit) or choose a grey palette"
+        )
+    return np.ma.masked_array(colours[..., 0], coloured) if coloured.any() else colours[..., 0]

@@ -1,0 +1,228 @@
+"""What a page shows: a spectrum, the heights behind it, the material, and the same grating in a scene."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Callable, Mapping
+from contextlib import AbstractContextManager
+from dataclasses import dataclass, fields, replace
+from pathlib import Path
+from typing import Any
+
+from ..errors import RequestError, is_number
+from ..grating_spectrum import GratingSpectrum
+from ..materials import refractive_index
+from ..precomputation import Spectrum, load_spectrum
+from ..progress import Progress, no_progress
+from ..recipe import Recipe, parameters_of_profile
+from ..settings import FROM_RADIUS, VISIBLE, wavelengths_inside
+from ..spectrum.tables import SliceTable
+from ..surface.gratings import PROFILES
+
+AIR = 1.000277  # index of the outside, as Mitsuba's "air"
+
+# WebGL2 guarantees array textures with sides of 2048 texels and 256 layers.
+MAX_SIDE, MAX_LAYERS = 2048 - 6, 256  # with the margin of spectrum.js
+
+_NOT_SHOWN = {
+    "transmission": "reflected light only",
+    "ext_ior": "a grating in air",
+    "lateral_scale": "a grating of one period",
+}
+"""Parameters of a scene that the page does not have, and what it shows instead."""
+
+_OF_DISC: dict[str, Any] = {"material": "Al", "coat_ior": 1.55, "orientation": "radial"}
+DISCS = ("compact_disc", "dvd")
+"""Profiles of discs; without parameters of their own they have the polycarbonate over their metal."""
+
+
+@dataclass(frozen=True)
+class ViewedMaterial:
+    """What the grating is made of, as in a scene.
+
+    Attributes:
+        int_ior: index of refraction of a dielectric.
+        material: or a conductor by Mitsuba's name, or "none", the perfect mirror.
+        orientation: degrees from the tangent to the pattern's x axis; or radial or tangential.
+        height_scale: factor of the heights.
+        coat_ior: index of a clear layer over the grating; one of none.
+    """
+
+    int_ior: float = 1.5
+    material: str = ""
+    orientation: float | str = 0.0
+    height_scale: float = 1.0
+    coat_ior: float = 1.0
+
+    def __post_init__(self) -> None:
+        for name in ("int_ior", "height_scale", "coat_ior"):
+            if not is_number(value := getattr(self, name)):
+                raise RequestError(f"{name}: got {value!r}, wanted a number")
+        if self.orientation not in tuple(FROM_RADIUS) and not is_number(self.orientation):
+            raise RequestError(f"orientation: got {self.orientation!r}, wanted degrees, radial or tangential")
+        if not 1 < self.int_ior <= 10:
+            raise RequestError(f"int_ior: got {self.int_ior!r}, wanted an index above 1, at most 10")
+        if not 1 <= self.coat_ior <= 10:
+            raise RequestError(f"coat_ior: got {self.coat_ior!r}, wanted an index of 1 (no layer) to 10")
+        if not self.height_scale >= 0:
+            raise RequestError(f"height_scale: got {self.height_scale!r}, wanted a number ≥ 0")
+        if self.material not in ("", "none"):
+            refractive_index(0.55, material=self.material)  # refuses unknown names
+
+
+@dataclass(frozen=True, eq=False)
+class Surface:
+    """A surface and its material.
+
+    Attributes:
+        name: its title.
+        spectrum: S(q; κ) as slices.
+        recipe: of the heights; None for a saved spectrum.
+        grating: the surface as parameters of `diffraction_grating`; files by their names, without folders.
+        material: its material.
+        command: that makes the file of `grating`, if it is not there yet.
+    """
+
+    name: str
+    spectrum: GratingSpectrum
+    recipe: Recipe | None
+    grating: Mapping[str, str | int | float]
+    material: ViewedMaterial
+    command: str = ""
+
+    def __post_init__(self) -> None:
+        spectrum: Spectrum = self.spectrum
+        if not isinstance(spectrum, GratingSpectrum):
+            raise RequestError(f"{self.name}: got theory=rigorous, wanted a surface of scalar theory")
+        if not isinstance(spectrum.table, SliceTable):
+            got = spectrum.representation
+            raise RequestError(f"{self.name}: got representation {got!r}, wanted 'slices'")
+        rows, columns = spectrum.grid.shape
+        if max(rows, columns) > MAX_SIDE or spectrum.table.intervals > MAX_LAYERS:
+            raise RequestError(
+                f"{self.name}: got a table of {columns} × {rows} nodes and {spectrum.table.intervals} intervals of κ, "
+                f"wanted at most {MAX_SIDE} × {MAX_SIDE} and {MAX_LAYERS}, the textures of WebGL2"
+            )
+        coat, shortest = self.material.coat_ior, spectrum.wavelengths[0]
+        if coat > 1 and coat / AIR * shortest > SHORTEST * (1 + 1e-6):
+            raise RequestError(
+                f"coat_ior: got {coat:g}, wanted at most {max(1, AIR * SHORTEST / shortest):.4g}: the spectrum was "
+                f"built for wavelengths from {shortest:g} nm; give the page a recipe or a profile"
+            )
+        if self.material.height_scale > (max_scale := self.max_height_scale) * (1 + 1e-6):
+            raise RequestError(
+                f"height_scale: got {self.material.height_scale:g}, wanted at most {max_scale:.4g}: the spectrum was "
+                f"built for wavelengths from {spectrum.wavelengths[0]:g} nm"
+            )
+
+    @property
+    def max_height_scale(self) -> float:
+        """The largest factor of the heights that the table covers for visible light."""
+        return max(1.0, SHORTEST / max(1.0, self.material.coat_ior / AIR) / self.spectrum.wavelengths[0])
+
+    @classmethod
+    def of_recipe(
+        cls,
+        recipe: Recipe,
+        name: str,
+        grating: Mapping[str, Any],
+        parameters: Mapping[str, Any],
+        progress: Callable[[str], AbstractContextManager[Progress]] = no_progress,
+        command: str = "",
+        known: tuple[str, ...] = (),
+    ) -> Surface:
+        """Return the surface of a recipe, whose spectrum is computed unless it is cached.
+
+        Args:
+            recipe: the surface.
+            name: its title.
+            grating: it as parameters of `diffraction_grating`.
+            parameters: of the material; others are refused.
+            progress: of the computation.
+            command: as the attribute.
+            known: names of the other parameters, for the message.
+        """
+        material = material_from(_with_plastic(recipe, parameters, covered=not command), known)
+        if recipe.settings.theory == "rigorous":  # before its table is computed
+            raise RequestError(f"{name}: got theory=rigorous, wanted a surface of scalar theory")
+        if not command and material.coat_ior > 1 and recipe.settings.wavelengths == VISIBLE:
+            settings = replace(recipe.settings, wavelengths=wavelengths_inside(material.coat_ior / AIR))
+            recipe = replace(recipe, settings=settings)
+        spectrum = recipe.cached(progress)
+        assert isinstance(spectrum, GratingSpectrum)
+        return cls(name, spectrum, recipe, grating, material, command)
+
+    @classmethod
+    def named(
+        cls,
+        source: str | os.PathLike[str],
+        parameters: Mapping[str, Any],
+        progress: Callable[[str], AbstractContextManager[Progress]] = no_progress,
+    ) -> Surface:
+        """Return the surface of a recipe (.toml), a saved spectrum (.exr) or a profile.
+
+        Args:
+            source: the file, or the name of the profile.
+            parameters: of the material, and of the profile and its spectrum.
+            progress: of the computation.
+
+        Raises:
+            FileNotFoundError: if there is no such file.
+            RequestError: if a parameter is wrong, or the page does not show such a surface.
+        """
+        path, values = Path(source), dict(parameters)
+        if path.suffix.lower() == ".exr":
+            material = material_from(values)
+            return cls(path.stem, load_spectrum(path), None, {"filename": path.name}, material)  # type: ignore[arg-type]
+        if path.suffix.lower() == ".toml":
+            recipe = Recipe.load(path)
+            return cls.of_recipe(recipe, path.stem, {"filename": path.name}, values, progress=progress)
+        name = os.fspath(source)
+        if name not in PROFILES:
+            raise RequestError(
+                f"surface: got {name!r}, wanted a recipe (.toml), a saved spectrum (.exr), a scan with its scale, or a "
+                f"profile ({', '.join(PROFILES)})"
+            )
+        known = parameters_of_profile(name)
+        if (theory := values.pop("theory", "scalar")) != "scalar":
+            raise RequestError(f"theory: got {theory}, wanted scalar")
+        grating = {key: values.pop(key) for key in known if key in values}
+        recipe = Recipe.of_profile(name, grating)
+        return cls.of_recipe(recipe, name, {"profile": name, **grating}, values, progress=progress, known=known)
+
+
+SHORTEST = VISIBLE[0]  # nm, of the wavelengths of a page
+
+
+def _with_plastic(recipe: Recipe, parameters: Mapping[str, Any], covered: bool) -> dict[str, Any]:
+    """Return the parameters of a material, and for a disc its own where they are not given.
+
+    Args:
+        recipe: of the surface.
+        parameters: as given.
+        covered: whether the spectrum is built for the light in a coat.
+    """
+    own = dict(_OF_DISC) if recipe.surface.get("profile") in DISCS else {}
+    if "int_ior" in parameters:
+        own.pop("material", None)
+    if not covered:
+        own.pop("coat_ior", None)
+    return own | dict(parameters)
+
+
+def material_from(parameters: Mapping[str, Any], others: tuple[str, ...] = ()) -> ViewedMaterial:
+    """Return the material from the parameters of a scene; `others` are names for the message.
+
+    Raises:
+        RequestError: if one is wrong, or not shown in a page.
+    """
+    known = {field.name for field in fields(ViewedMaterial)}
+    for name, value in parameters.items():
+        if name in _NOT_SHOWN:
+            raise RequestError(f"{name}: got {value!r}, and the page shows {_NOT_SHOWN[name]}")
+        if name not in known:
+            wanted = ", ".join((*sorted(known), *sorted(others)))
+            raise RequestError(f"{name}: got {value!r}, wanted a parameter among {wanted}")
+    if "material" in parameters and "int_ior" in parameters:
+        raise RequestError("material: a conductor or a perfect mirror takes no int_ior; give one or the other")
+    return replace(ViewedMaterial(), **parameters)

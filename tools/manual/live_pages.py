@@ -1,0 +1,52 @@
+"""The live page of the manual: a hook of MkDocs (mkdocs.yml), which makes it with the site.
+
+    python tools/manual/live_pages.py FOLDER
+
+writes it to a folder instead.
+"""
+
+from __future__ import annotations
+
+import sys
+from dataclasses import replace
+from pathlib import Path
+
+from mkdocs.config.defaults import MkDocsConfig
+from mkdocs.structure.files import File, Files
+
+from mitsuba_diffraction.viewer.page import page
+from mitsuba_diffraction.viewer.viewed_surface import Surface
+
+RECIPES = Path(__file__).parents[2] / "precompute"
+SURFACES = {
+    "compact_disc": ("Compact disc", "compact_disc.toml", {}),
+    "dvd": ("DVD", "dvd.toml", {}),
+    "foil": ("Foil of crossed gratings", "foil_crossed.toml", {"material": "Al"}),
+    "blaze": ("Blazed grating of aluminium", "blaze.toml", {"material": "Al"}),
+    "elaphe": ("Skin of Elaphe", "elaphe.toml", {}),
+    "xenopeltis": ("Skin of Xenopeltis", "xenopeltis.toml", {}),
+    "film": ("Film of diffraction glasses, reflected light", "film.toml", {}),
+    "scan": ("A scan: Elaphe, 5.9 µm", "elaphe_afm.toml", {}),
+}
+"""Title, recipe and material of each, in the order of the list in the page of all."""
+ALL = "surfaces"
+
+
+def live_page(name: str) -> str:
+    """Return the page of one of `SURFACES`, or of `ALL`, as HTML."""
+    surfaces = []
+    for title, recipe, parameters in SURFACES.values() if name == ALL else [SURFACES[name]]:
+        surfaces.append(replace(Surface.named(RECIPES / recipe, parameters), name=title))
+    return page(*surfaces)
+
+
+def on_files(files: Files, config: MkDocsConfig) -> Files:
+    """Add the page of all surfaces to the site, as live/surfaces.html."""
+    files.append(File.generated(config, f"live/{ALL}.html", content=live_page(ALL)))
+    return files
+
+
+if __name__ == "__main__":
+    folder = Path(sys.argv[1])
+    folder.mkdir(parents=True, exist_ok=True)
+    (folder / f"{ALL}.html").write_text(live_page(ALL), encoding="utf-8")
