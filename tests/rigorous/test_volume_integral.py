@@ -1,13 +1,11 @@
 """The solver of `tools/data/volume_integral.py` against other methods."""
 
-
 import numpy as np
 import pytest
+from volume_integral import extrapolated, solve
 
 from mitsuba_diffraction import gratings, rigorous
-from mitsuba_diffraction.scalar_theory import difference, incident_direction
-
-from volume_integral import extrapolated, solve
+from mitsuba_diffraction.scalar_theory import efficiency_difference, incident_direction
 
 WAVELENGTH, INDEX = 0.55, 1.5
 
@@ -25,9 +23,9 @@ def test_a_profile_has_the_orders_of_the_coordinate_transformation_method(direct
     found = extrapolated(surface.heights, (2.5, 2.5), light, WAVELENGTH, INDEX, (1, 64), 32, dtype=np.complex128)
     reflected, transmitted = (np.stack([m, 0 * m], axis=1) for m in (exact.orders, exact.transmitted_orders))
     eta = of(found.reflected, reflected, found.eta).mean(axis=0)
-    assert difference(eta, exact.unpolarised) < 3e-3
+    assert efficiency_difference(eta, exact.unpolarised) < 3e-3
     eta = of(found.transmitted, transmitted, found.eta_transmitted).mean(axis=0)
-    assert difference(eta, exact.transmitted_unpolarised) < 5e-4
+    assert efficiency_difference(eta, exact.transmitted_unpolarised) < 5e-4
 
 
 def test_the_error_decreases_with_the_square_of_the_voxels():
@@ -37,7 +35,7 @@ def test_the_error_decreases_with_the_square_of_the_voxels():
     for points, layers in ((64, 16), (128, 32)):
         found = solve(surface.heights, (2.5, 2.5), light, WAVELENGTH, INDEX, (1, points), layers)
         eta = of(found.reflected, np.stack([exact.orders, 0 * exact.orders], axis=1), found.eta).mean(axis=0)
-        errors.append(difference(eta, exact.unpolarised))
+        errors.append(efficiency_difference(eta, exact.unpolarised))
     assert errors[0] / errors[1] == pytest.approx(4, rel=0.1)
 
 
@@ -92,4 +90,4 @@ def test_a_checkerboard_has_the_orders_of_coupled_waves():
         depth * np.eye(2), (period, period), np.array([0.0, 0.0, 1.0]), WAVELENGTH, INDEX, (40, 40), 24, stepped=True
     )
     m = found.reflected
-    assert difference(found.eta.mean(axis=0), exact[harmonics + m[:, 1], harmonics + m[:, 0]]) < 1e-2
+    assert efficiency_difference(found.eta.mean(axis=0), exact[harmonics + m[:, 1], harmonics + m[:, 0]]) < 1e-2

@@ -24,7 +24,7 @@ from mitsuba_diffraction.inverse_design import Design
 from mitsuba_diffraction.inverse_design.far_field import lobes_in_bins
 from mitsuba_diffraction.inverse_design.plate import Plate
 from mitsuba_diffraction.inverse_design.target import wanted_fractions
-from mitsuba_diffraction.scalar_theory import difference, scalar_orders, tile_powers
+from mitsuba_diffraction.scalar_theory import efficiency_difference, scalar_orders, tile_powers
 
 Array = NDArray[np.float64]
 
@@ -100,20 +100,17 @@ def compared(plate: Design, wavelength: float, m: NDArray[np.int64], rigorous: A
         image = (along_y * eta) @ along_x.T
         found[f"{name}light"] = float(image[inside].sum())
         found[f"{name}correlation"] = float(np.corrcoef(wanted.ravel(), image.ravel())[0, 1])
-    found["misdirected"] = difference(scalar / scalar.sum(), exact / exact.sum())
+    found["misdirected"] = efficiency_difference(scalar / scalar.sum(), exact / exact.sum())
     found["worst"] = float(np.abs(scalar / scalar.sum() - exact / exact.sum()).max())
     found["reflected"] = float(exact.sum() / scalar.sum())
     return found
 
 
-def stored() -> list[tuple[Design, dict[float, dict[str, float]]]]:
-    """Return the stored plates, and for each wavelength the comparison."""
-    found = []
-    for case in json.loads(STORED.read_text(encoding="utf-8"))["cases"]:
-        plate = of_case(case)
-        rigorous = {of["wavelength"]: (np.array(of["orders"]), np.array(of["efficiencies"])) for of in case["solved"]}
-        found.append((plate, {wavelength: compared(plate, wavelength, *pair) for wavelength, pair in rigorous.items()}))
-    return found
+def compared_case(case: dict[str, Any]) -> tuple[Design, dict[float, dict[str, float]]]:
+    """Return the plate of a stored case, and for each wavelength its comparison."""
+    plate = of_case(case)
+    rigorous = {of["wavelength"]: (np.array(of["orders"]), np.array(of["efficiencies"])) for of in case["solved"]}
+    return plate, {wavelength: compared(plate, wavelength, *pair) for wavelength, pair in rigorous.items()}
 
 
 def of_case(case: dict[str, Any]) -> Design:
@@ -132,7 +129,8 @@ def rows() -> list[str]:
         return first if first == last else f"{first}–{last}"
 
     found = []
-    for plate, of_wavelengths in stored():
+    for case in json.loads(STORED.read_text(encoding="utf-8"))["cases"]:
+        plate, of_wavelengths = compared_case(case)
         values = {name: [of[name] for of in of_wavelengths.values()] for name in next(iter(of_wavelengths.values()))}
         kept = [exact / scalar for exact, scalar in zip(values["rigorous_light"], values["light"], strict=True)]
         cells = (

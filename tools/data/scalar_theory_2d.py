@@ -24,7 +24,7 @@ from mitsuba_diffraction.recipe import Recipe
 from mitsuba_diffraction.scalar_theory import (
     INDEX,
     WAVELENGTHS,
-    difference,
+    efficiency_difference,
     incident_direction,
     scalar_error,
     scalar_orders,
@@ -107,7 +107,7 @@ def solved(surface: md.HeightField, points: float, layers: float, stepped: bool)
             for n, (found, m, eta) in enumerate(pairs):
                 where = {tuple(pair): k for k, pair in enumerate(m.tolist())}
                 wanted = eta.mean(axis=0)[[where[tuple(pair)] for pair in found.m.tolist()]]
-                errors[n] += weight / len(WAVELENGTHS) * difference(found.unpolarised, wanted)
+                errors[n] += weight / len(WAVELENGTHS) * efficiency_difference(found.unpolarised, wanted)
             lost = max(lost, _lost(exact))
     return {
         "surface": surface.source,
