@@ -1,6 +1,6 @@
 """Compare designed plates with Maxwell's equations: `python tools/data/designed_plates.py [OUT.json]`.
 
-Small plates of glass are designed for a picture; the efficiencies of all their reflected orders are computed by
+Small plates of glass are designed for a picture; the efficiencies of all their orders are computed by
 `volume_integral`, half an hour on one core. The tests and the table of docs/design.md read the result. `python
 tools/data/designed_plates.py table` prints the table.
 """
@@ -24,7 +24,7 @@ from mitsuba_diffraction.inverse_design import Design
 from mitsuba_diffraction.inverse_design.far_field import lobes_in_bins
 from mitsuba_diffraction.inverse_design.plate import Plate
 from mitsuba_diffraction.inverse_design.target import wanted_fractions
-from mitsuba_diffraction.scalar_theory import efficiency_difference, scalar_orders, tile_powers
+from mitsuba_diffraction.scalar_theory import efficiency_difference, scalar_orders, tile_powers, transmitted_orders
 
 Array = NDArray[np.float64]
 
@@ -32,8 +32,12 @@ STORED = Path(__file__).parents[2] / "tests" / "data" / "designed_plates.json"
 INDEX = 1.5
 WAVELENGTHS = (450.0, 550.0, 650.0)
 ANGLE, TOOL_BLUR = 17.5, 0.13  # as by default
-# Texel in µm, their number along the period, height range in µm.
-PLATES = ((0.6, 8, 0.4), (0.8, 8, 0.4), (1.2, 6, 0.4), (0.6, 8, 0.8), (0.8, 8, 0.8), (1.2, 6, 0.8))
+# Texel in µm, their number along the period, height range in µm, and whether the light is reflected or transmitted.
+PLATES = tuple(
+    (*texels, height_range, light)
+    for height_range, light in ((0.4, "reflected"), (0.8, "reflected"), (0.8, "transmitted"))
+    for texels in ((0.6, 8), (0.8, 8), (1.2, 6))
+)
 POINTS, LAYERS = 4.5, 25.0  # per wavelength in air, at the coarser resolution
 _DIGITS = 7  # of efficiencies, as fractions of the incident light
 
@@ -44,16 +48,26 @@ def picture() -> Array:
     return (np.hypot(x - 0.3, y) < 0.4).astype(float)
 
 
-def designed(texel: float, texels: int, height_range: float) -> Design:
+def designed(texel: float, texels: int, height_range: float, light: str) -> Design:
     """Design the plate."""
-    return md.design(picture(), texel, texels, height_range, ANGLE, WAVELENGTHS, tool_blur=TOOL_BLUR)
+    index = INDEX if light == "transmitted" else None
+    return md.design(picture(), texel, texels, height_range, ANGLE, WAVELENGTHS, index, tool_blur=TOOL_BLUR)
 
 
-def predicted(plate: Design, wavelength: float) -> tuple[NDArray[np.int64], Array]:
-    """Return the orders, (n, 2), and their efficiencies by scalar theory, unpolarised; wavelength in nm."""
+def predicted(plate: Design, wavelength: float) -> tuple[NDArray[np.int64], Array, Array | float]:
+    """Return the orders, (n, 2), their efficiencies by scalar theory, unpolarised, and a factor; wavelength in nm.
+
+    Efficiencies are those of the relief. The flat face of a sheet transmits the factor of each order.
+    """
     powers = tile_powers(plate.height_field, wavelength * 1e-3)
-    found = scalar_orders(powers, 2 * (plate.plate.period,), wavelength * 1e-3, 0.0, INDEX)
-    return found.m, found.unpolarised
+    arguments = powers, 2 * (plate.plate.period,), wavelength * 1e-3, 0.0, INDEX
+    if plate.plate.int_ior is None:
+        reflected = scalar_orders(*arguments)
+        return reflected.m, reflected.unpolarised, 1.0
+    inside, outside = (transmitted_orders(*arguments, sheet=sheet) for sheet in (False, True))
+    kept = {tuple(m): n for n, m in enumerate(inside.m.tolist())}
+    eta = inside.unpolarised[[kept[tuple(m)] for m in outside.m.tolist()]]
+    return outside.m, eta, np.divide(outside.unpolarised, eta, out=np.ones_like(eta), where=eta > 0)
 
 
 def solved(plate: Design, wavelength: float, refined: float = 1.0) -> dict[str, Any]:
@@ -72,9 +86,11 @@ def solved(plate: Design, wavelength: float, refined: float = 1.0) -> dict[str, 
         (points, points),
         layers,
     )
+    reflects = plate.plate.int_ior is None
+    m, eta = (found.reflected, found.eta) if reflects else (found.transmitted, found.eta_transmitted)
     return {
-        "orders": found.reflected.tolist(),
-        "efficiencies": found.eta.mean(axis=0).round(_DIGITS).tolist(),
+        "orders": m.tolist(),
+        "efficiencies": eta.mean(axis=0).round(_DIGITS).tolist(),
         "iterations": found.iterations,
         "lost": float(f"{found.lost:.1e}"),
         "seconds": round(time.process_time() - began),
@@ -82,16 +98,17 @@ def solved(plate: Design, wavelength: float, refined: float = 1.0) -> dict[str, 
 
 
 def compared(plate: Design, wavelength: float, m: NDArray[np.int64], rigorous: Array) -> dict[str, float]:
-    """Compare the efficiencies η of orders m with the prediction; all but `reflected` as fractions of reflected light.
+    """Compare the efficiencies η of orders m with the prediction; all but `total` as fractions of the light in orders.
 
     Returns:
         light, rigorous_light: in the target; correlation, rigorous_correlation: with the target; misdirected: Σ|Δη|;
-        worst: the maximum of |Δη|; reflected: rigorous by predicted Σ η.
+        worst: the maximum of |Δη|; total: rigorous by predicted Σ η.
     """
     at = int(np.argmin(np.abs(plate.wavelengths - wavelength)))
-    orders, scalar = predicted(plate, wavelength)
+    orders, scalar, factor = predicted(plate, wavelength)
     where = {tuple(pair): n for n, pair in enumerate(m.tolist())}
-    exact = np.array([rigorous[where[tuple(pair)]] for pair in orders.tolist()])
+    exact = factor * rigorous[[where[tuple(pair)] for pair in orders.tolist()]]
+    scalar = factor * scalar
     wanted, inside = plate.wanted[at], plate.inside[at]
     edges, period, length = plate.plate.edges(len(wanted)), plate.plate.period, plate.plate.coherence_length
     along_x, along_y = (lobes_in_bins(edges, one, period, wavelength * 1e-3, length) for one in orders.T)
@@ -102,7 +119,7 @@ def compared(plate: Design, wavelength: float, m: NDArray[np.int64], rigorous: A
         found[f"{name}correlation"] = float(np.corrcoef(wanted.ravel(), image.ravel())[0, 1])
     found["misdirected"] = efficiency_difference(scalar / scalar.sum(), exact / exact.sum())
     found["worst"] = float(np.abs(scalar / scalar.sum() - exact / exact.sum()).max())
-    found["reflected"] = float(exact.sum() / scalar.sum())
+    found["total"] = float(exact.sum() / scalar.sum())
     return found
 
 
@@ -115,8 +132,9 @@ def compared_case(case: dict[str, Any]) -> tuple[Design, dict[float, dict[str, f
 
 def of_case(case: dict[str, Any]) -> Design:
     """Return the plate of a stored case, from the heights of its texels."""
-    texel, texels, height_range = case["plate"]
-    plate = Plate(texel, texels, height_range, ANGLE, np.array(WAVELENGTHS), None, None, TOOL_BLUR)
+    *lengths, light = case["plate"]
+    index = INDEX if light == "transmitted" else None
+    plate = Plate(*lengths, ANGLE, np.array(WAVELENGTHS), index, None, TOOL_BLUR)
     heights, wanted = np.array(case["heights"]), wanted_fractions(picture(), plate)
     return Design.of(heights, plate, wanted[..., ::-1] if plate.mirrored else wanted)
 
@@ -129,11 +147,13 @@ def rows() -> list[str]:
         return first if first == last else f"{first}–{last}"
 
     found = []
-    for case in json.loads(STORED.read_text(encoding="utf-8"))["cases"]:
+    cases = json.loads(STORED.read_text(encoding="utf-8"))["cases"]
+    for case in sorted(cases, key=lambda case: PLATES.index(tuple(case["plate"]))):
         plate, of_wavelengths = compared_case(case)
         values = {name: [of[name] for of in of_wavelengths.values()] for name in next(iter(of_wavelengths.values()))}
         kept = [exact / scalar for exact, scalar in zip(values["rigorous_light"], values["light"], strict=True)]
         cells = (
+            case["plate"][-1],
             f"{plate.plate.texel:g} µm",
             f"{plate.plate.height_range:g} µm",
             f"{between(values['light'], 0, 0.01)} %",
@@ -150,12 +170,13 @@ def make(path: Path) -> None:
     """Design and solve all plates; what `path` holds already is kept."""
     content: dict[str, Any] = {"made by": "python tools/data/designed_plates.py"}
     content["units"] = (
-        "plate: texel in µm, texels, height range in µm; heights of the texels in µm; wavelength in nm; efficiencies "
-        "of reflected orders (m_x, m_y), unpolarised light along the normal, as fractions of the incident light; "
+        "plate: texel in µm, texels, height range in µm, light; heights of the texels in µm; wavelength in nm; "
+        "efficiencies of orders (m_x, m_y), transmitted ones in the glass, for unpolarised light along the normal, as "
+        "fractions of the incident light; "
         f"n = {INDEX}"
     )
     content["cases"] = json.loads(path.read_text())["cases"] if path.exists() else []
-    for plate in PLATES:
+    for plate in sorted(PLATES):  # those of the smallest texels, which take least time, first
         if any(tuple(case["plate"]) == plate for case in content["cases"]):
             continue
         found = designed(*plate)

@@ -7,11 +7,12 @@ docs/validation.md read the result.
 
 from __future__ import annotations
 
+import itertools
 import json
 import math
 import sys
 import time
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -22,8 +23,8 @@ import mitsuba_diffraction as md
 from mitsuba_diffraction.files import whole_file
 from mitsuba_diffraction.recipe import Recipe
 from mitsuba_diffraction.scalar_theory import (
+    ERROR_WAVELENGTHS,
     INDEX,
-    WAVELENGTHS,
     efficiency_difference,
     incident_direction,
     scalar_error,
@@ -35,9 +36,10 @@ from mitsuba_diffraction.scalar_theory import (
 ROOT = Path(__file__).parents[2]
 STORED = ROOT / "tests" / "data" / "scalar_theory_2d.json"
 ANGLES, WEIGHTS = (0.0, 20.0), (1 / 3, 2 / 3)  # −20° is as 20°: all surfaces are symmetric in x
+PERIODS, DEPTHS = (0.75, 1.2, 1.7, 2.3, 2.9), (0.1, 0.25)  # µm, of crossed sinusoids and checkerboards
 SKINS = ("elaphe", "xenopeltis", "elaphe_afm", "xenopeltis_afm")
 CUT = 3.0  # µm, the edge of a cut-out, of half a period
-_PIXELS = 32  # of a sinusoid along its period
+_PIXELS, _SQUARES = 32, 128  # along a period: of a sinusoid, of a checkerboard, whose steps need more
 
 
 def crossed(period: float, depth: float) -> md.HeightField:
@@ -48,8 +50,8 @@ def crossed(period: float, depth: float) -> md.HeightField:
 
 def checkerboard(period: float, depth: float) -> md.HeightField:
     """Return squares of half a period, high and low."""
-    squares = np.kron(depth * np.eye(2), np.ones((_PIXELS // 2, _PIXELS // 2)))
-    return md.HeightField(squares, period / _PIXELS, f"checkerboard {period:g} × {depth:g} µm")
+    squares = np.kron(depth * np.eye(2), np.ones((_SQUARES // 2, _SQUARES // 2)))
+    return md.HeightField(squares, period / _SQUARES, f"checkerboard {period:g} × {depth:g} µm")
 
 
 def cut_out(skin: str, scale: float = 1.0) -> md.HeightField:
@@ -71,28 +73,35 @@ def surfaces() -> Iterator[tuple[md.HeightField, float, float, bool]]:
     for name in ("foil_crossed", "foil_hexagonal"):
         foil = Recipe.load(ROOT / "precompute" / f"{name}.toml").height_field()
         yield md.HeightField(foil.heights, foil.pixel_size, name), 20, 100, False
-    for period in (0.75, 1.2, 1.7, 2.3, 2.9):
-        for depth in (0.1, 0.25):
-            yield crossed(period, depth), 20, 100, False
-            yield checkerboard(period, depth), 20, 100, True
-    for scale in (1.0, 0.5):
-        for skin in SKINS:
-            yield cut_out(skin, scale), 10, 60, False
+    for depth, period in itertools.product(DEPTHS, PERIODS):
+        yield crossed(period, depth), 20, 100, False
+    for skin in SKINS:
+        yield cut_out(skin), 10, 60, False
+    for depth, period in itertools.product(DEPTHS, PERIODS):
+        yield checkerboard(period, depth), 20, 100, True
+    for skin in SKINS:
+        yield cut_out(skin, 0.5), 10, 60, False
+
+
+def kind_of(case: dict[str, Any]) -> str:
+    """Return "smooth", "checkerboard" or "measured"."""
+    name = case["surface"].split()[0]
+    return "measured" if name in SKINS else "checkerboard" if name == "checkerboard" else "smooth"
 
 
 def solved(surface: md.HeightField, points: float, layers: float, stepped: bool) -> dict[str, Any]:
     """Return the estimated and the solved error of scalar theory, of reflected and of transmitted light."""
     began, period = time.process_time(), surface.tile_size
-    powers = tile_powers(surface, min(WAVELENGTHS))
+    powers = tile_powers(surface, min(ERROR_WAVELENGTHS))
     estimate = scalar_error(surface)
     heights = surface.heights
     unit = 4 if stepped else 2  # voxels that an edge of the checkerboard must not cut, at either resolution
     counts = tuple(unit * math.ceil(points * length / unit) for length in period[::-1])
     if stepped:
-        heights = heights[:: _PIXELS // 2, :: _PIXELS // 2]
+        heights = heights[:: _SQUARES // 2, :: _SQUARES // 2]
     count = 2 * math.ceil(layers * np.ptp(heights) / 2)
     errors, lost = np.zeros(2), 0.0
-    for wavelength in WAVELENGTHS:
+    for wavelength in ERROR_WAVELENGTHS:
         for angle, weight in zip(ANGLES, WEIGHTS, strict=True):
             light = incident_direction(angle, 0.0)
             exact = extrapolated(heights, period, light, wavelength, INDEX, counts, count, stepped=stepped)
@@ -107,7 +116,7 @@ def solved(surface: md.HeightField, points: float, layers: float, stepped: bool)
             for n, (found, m, eta) in enumerate(pairs):
                 where = {tuple(pair): k for k, pair in enumerate(m.tolist())}
                 wanted = eta.mean(axis=0)[[where[tuple(pair)] for pair in found.m.tolist()]]
-                errors[n] += weight / len(WAVELENGTHS) * efficiency_difference(found.unpolarised, wanted)
+                errors[n] += weight / len(ERROR_WAVELENGTHS) * efficiency_difference(found.unpolarised, wanted)
             lost = max(lost, _lost(exact))
     return {
         "surface": surface.source,
@@ -119,6 +128,22 @@ def solved(surface: md.HeightField, points: float, layers: float, stepped: bool)
         "lost": float(f"{lost:.1e}"),
         "seconds": round(time.process_time() - began),
     }
+
+
+def rms_factor(cases: Sequence[dict[str, Any]], part: int) -> float:
+    """Return the r.m.s. factor between estimate and error, of reflected (0) or transmitted (1) light."""
+    ratios = [case["estimated"][part] / case["error"][part] for case in cases]
+    return float(np.exp(np.sqrt(np.mean(np.log(ratios) ** 2))))
+
+
+def rows() -> list[str]:
+    """Return the rows of the table of docs/validation.md."""
+
+    def pair(case: dict[str, Any], part: int) -> str:
+        return ", ".join(f"{100 * float(f'{case[name][part]:.2g}'):.3g} %" for name in ("error", "estimated"))
+
+    cases = json.loads(STORED.read_text(encoding="utf-8"))["cases"]
+    return [f"| {case['surface']} | {case['range']:.2f} µm | {pair(case, 0)} | {pair(case, 1)} |" for case in cases]
 
 
 def _lost(found: Orders) -> float:
@@ -146,4 +171,7 @@ def make(path: Path) -> None:
 
 
 if __name__ == "__main__":
-    make(Path(sys.argv[1]) if len(sys.argv) > 1 else STORED)
+    if sys.argv[1:] == ["table"]:
+        print("\n".join(rows()))
+    else:
+        make(Path(sys.argv[1]) if len(sys.argv) > 1 else STORED)
