@@ -455,12 +455,11 @@ def render(
 
     The samples are split into passes with independent seeds, which are added in the order of their indices. The same
     seed therefore gives the same bits (within the limits of `trace_pass`), interrupted or not, on one machine or on
-    several.
+    several. For `width`, `height`, `parameters`, `materials` and `motion` see `load_spectral_scene`.
 
     Args:
-        scene_path: an XML scene; its film may be of any kind (see `load_spectral_scene`).
+        scene_path: an XML scene; its film may be of any kind.
         spp: samples per pixel, four wavelengths each; the scene's sampler may add up to three.
-        width, height, parameters, materials, motion: see `load_spectral_scene`.
         seed: random seed, not negative.
         until_error: stop when the relative error of the picture (`error_of_picture`) is at most this; spp is then the
             maximum.

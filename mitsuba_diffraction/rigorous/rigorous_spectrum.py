@@ -396,7 +396,9 @@ class RigorousSpectrum:
         where g has the sign of ν² − k_y².
 
         Args:
-            m, c, g: the order and these coordinates, broadcast against each other.
+            m: the order, broadcast against c, g and the wavelength.
+            c: as above.
+            g: as above.
             wavelength: µm, in the medium of side 0.
             sides: of ω_i and of ω_o, 0 above and 1 below.
             mueller: whether to return M_ij, (…, 4, 4), for k_y ≥ 0.
