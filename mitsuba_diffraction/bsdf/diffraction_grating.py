@@ -181,7 +181,7 @@ def refuse_wrong(props: mi.Properties) -> None:
     kinds, objects, profile = mi.Properties.Type, dict(props.objects()), props.get("profile")
     is_known = isinstance(profile, str) and (profile := RENAMED.get(profile, profile)) in PROFILES
     nested = {name for name, value in objects.items() if isinstance(value, mi.BSDF)}  # `base_from` names others
-    # `surface_from` lists the profiles.
+    # `profile_name` refuses unknown profiles.
     known = {*types, *(parameters_of_profile(profile) if is_known else ())}
     if (profile is None or is_known) and (unknown := sorted(set(props.keys()) - known - nested)):
         raise RequestError(f"{', '.join(unknown)}: unknown, wanted one of {', '.join(sorted(known))}")

@@ -22,10 +22,10 @@ from scipy.ndimage import map_coordinates
 
 from ..energy.furnace import Furnace
 from ..energy.table import Layout, frequencies_of
+from ..film_stack import Stack
 from ..geometry import fresnel
 from ..grating_spectrum import GratingSpectrum
 from ..spectrum.grids import OrderGrid
-from ..stack import Stack
 from .device_tables import NumberTable, PacketTable, integer_part, larger, opaque
 from .directions import Incidence, cell_of
 from .inversion import direction_bin, direction_borders, search

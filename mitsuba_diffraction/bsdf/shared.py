@@ -12,10 +12,10 @@ import mitsuba as mi
 import numpy as np
 
 from ..energy.table import EnergyTable
+from ..film_stack import Stack
 from ..grating_spectrum import GratingSpectrum
 from ..settings import VISIBLE
 from ..spectrum.grids import OrderGrid
-from ..stack import Stack
 from .continuum import SplineSpectrum
 from .energy_factor import Energy
 from .order_sampler import OrderSampler

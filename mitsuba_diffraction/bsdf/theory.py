@@ -14,12 +14,12 @@ import numpy as np
 
 from ..energy.furnace import small_kappas
 from ..errors import RequestError
+from ..film_stack import Stack
 from ..geometry import SHADOWING
 from ..grating_spectrum import GratingSpectrum
 from ..precomputation import Spectrum
 from ..rigorous.rigorous_spectrum import RigorousSpectrum
 from ..settings import VISIBLE
-from ..stack import Stack
 from .coat import SAME_INDEX, Coat
 from .device_tables import opaque
 from .directions import Geometry, Incidence, Interface, rotated

@@ -1,6 +1,7 @@
 """Thin films on the relief: zinc sulphide of a hologram, the oxide of anodised titanium, the stack of a beetle.
 
-R and T of a plane under the films follow from the characteristic matrices of `../stack.py`. One film is evaluated
+R and T of a plane under the films follow from the characteristic matrices of `../film_stack.py`, which E and samplers
+use as well (`film_stack.powers`: what changes |r|² or |t|² here changes it there). One film is evaluated
 without a loop. Several films are evaluated by a loop over a table of their indices, whose length is opaque.
 """
 
@@ -14,7 +15,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from .. import stack
+from .. import film_stack
 from ..errors import RequestError
 from ..materials import RefractiveIndex
 from .device_tables import PacketTable, integer_part, larger, limited, opaque
@@ -73,7 +74,7 @@ class _Plane:
         found = []
         of_s, of_p = (self.z_0, mi.Complex2f(1, 0)), (self.z_0 / dr.square(self.n_0), self.n_0 / self.n_s)
         for field, (y_0, gain) in zip(fields, (of_s, of_p), strict=True):
-            reflected, incident = stack.reflected_and_incident(field, y_0)
+            reflected, incident = film_stack.reflected_and_incident(field, y_0)
             found.append(Wave(reflected, 2 * y_0 * gain * across, incident))
         return found
 
@@ -113,7 +114,7 @@ def _crossed(
         factor = dr.exp(-delta.imag) * mi.Complex2f(cos, sin)
         twice = factor * factor
         u, v, across = 0.5 * (1 + twice), 0.5 * (1 - twice), across * factor
-    return [stack.across_film(field, y, u, v) for field, y in zip(fields, (z, z / (n * n)), strict=True)], across
+    return [film_stack.across_film(field, y, u, v) for field, y in zip(fields, (z, z / (n * n)), strict=True)], across
 
 
 def with_film(props: mi.Properties, material: Material) -> Material:
@@ -227,10 +228,10 @@ class _Filmed(Material):
                 "(coat_ior)"
             )
 
-    def stack(self, eta: float) -> stack.Stack:
+    def stack(self, eta: float) -> film_stack.Stack:
         thicknesses, scales = self.thicknesses()
         films = tuple((n, float(d)) for n, d in zip(self.films, thicknesses, strict=True))
-        return stack.Stack(self.outside, self.below.stack(eta).below, films, scales)
+        return film_stack.Stack(self.outside, self.below.stack(eta).below, films, scales)
 
     def _waves(
         self, si: mi.SurfaceInteraction3f, cos: mi.Float, active: mi.Bool, with_phase: bool

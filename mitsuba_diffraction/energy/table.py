@@ -51,9 +51,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..errors import RequestError
+from ..film_stack import MAX_PHASE_STEP, Stack
 from ..spectrum.grids import OrderGrid
 from ..spectrum.power_spectrum import PowerSpectrum
-from ..stack import MAX_PHASE_STEP, Stack
 from .furnace import MAX_E, Furnace, Real
 
 MAX_LINE_NODES = 1.2e5  # nodes of the table of a line grating, about

@@ -8,7 +8,7 @@ import tmm
 from bsdf_support import bitmap, direction, draw, evaluate, floats, interaction, six_samples, use
 from test_thin_film import load, material_of, pairs, powers
 
-from mitsuba_diffraction import stack, testing
+from mitsuba_diffraction import film_stack, testing
 from mitsuba_diffraction.materials import constant, index_of, refractive_index
 
 WAVELENGTHS = (420.0, 500.0, 580.0, 660.0)
@@ -36,7 +36,7 @@ def test_r_and_t_in_numpy_are_those_of_transfer_matrices():
     for films, below, wavelength, angle in random_stacks(200):
         layers = [(n, 1e3 * d / wavelength) for n, d in films]
         for indices, cosine in (((1.0, layers, below), np.cos(angle)), ((below, layers[::-1], 1.0), 0.9)):
-            reflected, transmitted = stack.powers(np.array(cosine), *indices)
+            reflected, transmitted = film_stack.powers(np.array(cosine), *indices)
             of_tmm = [
                 solved(pol, [(n, d * wavelength * 1e-3) for n, d in indices[1]], indices[2], wavelength, a, indices[0])
                 for pol, a in zip("sp", [np.arccos(cosine)] * 2, strict=True)
@@ -326,5 +326,5 @@ def test_a_constant_index_stays_as_fast_and_as_it_was(llvm):
     bsdf = load(int_ior=1.5, ext_ior=1.0, transmission="interface")
     assert material_of(bsdf).dispersion is None
     assert not bsdf.layers.interface.disperses
-    assert stack.Stack(1.0, constant(1.5)).is_plain
+    assert film_stack.Stack(1.0, constant(1.5)).is_plain
     assert six_samples(bsdf, [direction(20), direction(50)]).shape == (13, 6)

@@ -4,7 +4,8 @@
     python tools/manual/figures.py terms gallery/window
 
 A command writes to a temporary folder, {out}; its figures then replace those in docs/. The commands of the gallery are
-on its page.
+on its page. What `mitsuba-diffraction NAME` draws is in the module that `evaluation/commands/NAME.py` or `cli/NAME.py`
+calls.
 """
 
 from __future__ import annotations

@@ -19,7 +19,7 @@ from ...errors import RequestError, is_number
 from ...files import refuse_special
 from ...settings import Settings
 from ..heightfield import HeightField
-from . import gwyddion, images, instruments, interferometers, mended, text
+from . import gwyddion, images, instruments, interferometers, text, workarounds
 from .scan import Scan, micrometres, pair
 
 __all__ = ["read_height_field"]
@@ -220,7 +220,7 @@ def _extension_of_content(path: Path) -> str:
     if text.is_gwyddion_export(start):
         return ".asc"
     found = next((extension for magic, extension in _MAGIC.items() if start.startswith(magic)), path.suffix.lower())
-    return ".jpk-qi-data" if found == ".x3p" and mended.is_jpk(path) else found
+    return ".jpk-qi-data" if found == ".x3p" and workarounds.is_jpk(path) else found
 
 
 def _as_micrometres(numbers: NDArray, height_range: float | None) -> NDArray[np.float64]:

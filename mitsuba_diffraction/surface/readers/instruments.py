@@ -17,7 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ...errors import RequestError
-from . import mended, scan
+from . import scan, workarounds
 from .scan import MAX_ARRAY_BYTES, Channel, Scan, choose_channel
 
 EXTRA = "pip install 'mitsuba_diffraction[instruments]'"
@@ -61,7 +61,7 @@ def read_instrument(path: Path, unit: str | tuple[str, str] | None, channel: str
         if name != "jpk":  # of whose archives one member is read
             _refuse_bomb(path)
         library = lookup_reader_by_format[name]
-        contents, doubts = mended.rewritten(path, name)
+        contents, doubts = workarounds.rewritten(path, name)
         try:
             found = {c.index: c for c in library(contents).channels}
             chosen = choose_channel(
@@ -76,7 +76,7 @@ def read_instrument(path: Path, unit: str | tuple[str, str] | None, channel: str
                 raise RequestError(f"got {source.nb_grid_pts} pixels, wanted at most {MAX_ARRAY_BYTES} bytes")
             given, own = scan.pair(unit), source.unit or ""
             along, high = (scan.scale(own, one, "its lengths") for one in given)
-            if name == "ibw" and not mended.ibw_has_unit(contents):
+            if name == "ibw" and not workarounds.ibw_has_unit(contents):
                 high = scan.scale("", given[1], "the heights")
             topography = source.topography() if own else source.topography(unit=given[0])
             heights: NDArray[np.float64] = np.ma.asarray(topography.heights(), np.float64).T
@@ -91,18 +91,18 @@ def read_instrument(path: Path, unit: str | tuple[str, str] | None, channel: str
                 f".sdf ({type(error).__name__}{f': {error}' if str(error) else ''})"
             ) from None
         if name == "nms":
-            heights, factor = mended.nms(path, heights)
+            heights, factor = workarounds.nms(path, heights)
             along *= factor
     rows, columns = heights.shape
     doubt = doubts[chosen.number] if doubts else ""
     if not own and size == (columns, rows):
         size = None  # without a unit these are pixels
     if name == "jpk":
-        x, y, doubt = mended.jpk(source.info["raw_metadata"], heights.shape)
+        x, y, doubt = workarounds.jpk(source.info["raw_metadata"], heights.shape)
         size = x * size[0], y * size[1]
     if name == "ibw" and size is not None:
         note = source.info.get("raw_metadata", {})
-        doubt = mended.ibw(note, (along * size[0], along * size[1]), heights.shape)
+        doubt = workarounds.ibw(note, (along * size[0], along * size[1]), heights.shape)
     pixel_size = (size[0] * along / columns, size[1] * along / rows) if size is not None else None
     return Scan(heights * high, pixel_size, chosen.name, doubt)
 
