@@ -30,7 +30,7 @@ QUICK = (0.6, 8, 0.4, "reflected")
 def test_scalar_theory_predicts_the_light_in_the_picture(case):
     plate, of_wavelengths = designed_plates.compared_case(case)
     for wavelength, found in of_wavelengths.items():
-        assert found["rigorous_light"] == pytest.approx(found["light"], rel=0.02), wavelength
+        assert found["rigorous_light"] == pytest.approx(found["light"], rel=0.03), wavelength
         assert found["rigorous_correlation"] == pytest.approx(found["correlation"], abs=1e-3), wavelength
     # What `design` reports leaves out the reflectance of glass, which varies little over these angles.
     np.testing.assert_allclose(plate.efficiency, [found["light"] for found in of_wavelengths.values()], atol=0.01)

@@ -1,8 +1,8 @@
 """Check the error of scalar theory in two dimensions: `python tools/data/scalar_theory_2d.py [OUT.json]`.
 
 For surfaces that vary along x and y, the error of scalar theory is determined by `volume_integral`, under the
-conditions of `scalar_theory.scalar_error`, whose estimate stands beside it; half an hour on one core. The tests and
-docs/validation.md read the result.
+conditions of `scalar_theory.scalar_error`, whose estimate stands beside it; five minutes of processor time. The tests
+and docs/validation.md read the result.
 """
 
 from __future__ import annotations

@@ -218,7 +218,7 @@ class _Period:
     def _scattered(self, polarisation: Complex) -> tuple[Complex, list[Complex], list[Complex]]:
         """Return the field of P = (ε − 1) E, both as Fourier coefficients (3, layers, rows, columns).
 
-        Also the amplitudes of s and p of the waves down at z = 0 and up at the top of the slab.
+        Also the amplitudes of s and p of the waves down at z = 0 and up at the top of the relief.
         """
         field = np.zeros_like(polarisation)
         field[2] = -polarisation[2]
