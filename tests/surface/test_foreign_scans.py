@@ -10,7 +10,7 @@ import pytest
 from foreign_scans import COLUMNS, DX, DY, REVISION, ROWS, ibw, jpk, nms, park, sur, tmd, wyko, x3p, zygo
 from test_instrument_files import needs_the_extra
 
-from mitsuba_diffraction.surface.readers import read_height_field
+from mitsuba_diffraction.surface.readers import read_height_field, workarounds
 
 MISSING = [(7, 11), (7, 12)]
 INSTRUMENTS = {
