@@ -254,6 +254,17 @@ def test_the_files_that_the_readme_names_exist():
         assert (ROOT / name).is_file(), name
 
 
+def test_the_manual_begins_with_the_table_of_the_readme():
+    def table(page):
+        return re.search(r"^\| you have \|.*?\n\n", page.read_text(encoding="utf-8"), re.MULTILINE | re.DOTALL)[0]
+
+    assert table(ROOT / "docs" / "index.md") == table(PAGES[0]).replace("](docs/", "](")
+
+
+def test_the_readme_is_short():
+    assert len(PAGES[0].read_text(encoding="utf-8").splitlines()) <= 140
+
+
 def test_what_the_page_on_the_thesis_names_exists(command):
     text = (ROOT / "docs" / "thesis.md").read_text(encoding="utf-8")
     named = re.findall(r"`([\w./]+\.(?:py|md|toml|xml|ipynb|png))`", text)

@@ -100,7 +100,7 @@ def save_design_picture(design: Design, path: str | os.PathLike[str]) -> None:
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure
 
-    figure = Figure(figsize=(15, 4), dpi=120, layout="constrained")
+    figure = Figure(figsize=(12, 3.4), dpi=150, layout="constrained")
     FigureCanvasAgg(figure)
     panels = figure.subplots(1, 4, width_ratios=(1, 1, 1.15, 1.1))
     edge = float(design.plate.edges(1)[1])
@@ -109,11 +109,11 @@ def save_design_picture(design: Design, path: str | os.PathLike[str]) -> None:
     right = -edge if design.plate.mirrored else edge
     for axes, name, light in zip(panels[:2], ("target", title), design.seen, strict=True):
         axes.imshow(on_screen(into_gamut(light), plain_view), extent=(-right, right, -edge, edge), origin="lower")
-        axes.set(title=name, xlabel="$x$ of $\\omega_o$", ylabel="$y$ of $\\omega_o$")
+        axes.set(title=name, xlabel="direction, x", ylabel="direction, y")
     field = design.height_field
     image = panels[2].imshow(field.heights, extent=(0, field.tile_size[0], 0, field.tile_size[1]), origin="lower")
-    figure.colorbar(image, ax=panels[2], label="µm")
-    panels[2].set(title="relief, one period", xlabel="x, µm", ylabel="y, µm")
+    figure.colorbar(image, ax=panels[2])
+    panels[2].set(title="relief, heights in µm", xlabel="x, µm", ylabel="y, µm")
     _plot_efficiency(panels[3], design)
     with whole_file(path) as temporary:
         figure.savefig(temporary, metadata=METADATA)

@@ -123,6 +123,7 @@ FIGURES = (
             --width 192 --spp 32 -o {out}/taylor_snake.png""",
         12,
     ),
+    Figure(("taylor_row.png",), "python tools/manual/taylor_row.py {out}/taylor_row.png", 2),
     Figure(("terms.png",), "mitsuba-diffraction benchmark --terms --plot {out}/terms.png", 10),
     Figure(("published_snakes.png",), "python tools/thesis/published_snakes.py {out}/published_snakes.png", 3),
     Figure(
