@@ -12,6 +12,7 @@ from __future__ import annotations
 
 import itertools
 from collections.abc import Sequence
+from dataclasses import replace
 from typing import cast
 
 import drjit as dr
@@ -85,7 +86,7 @@ class OrderSampler:
         max_phase = MAX_LINE_PHASE if 0 in grid.max_order else MAX_PHASE
         self.slices = int(np.clip(phase * coat_index / max_phase, MIN_WAVELENGTH_BINS, MAX_WAVELENGTH_BINS))
         orders = np.minimum((1 + self.eta) * self.tile * (first + last) / 2, 2 * self.max_order) + 1
-        ranges = list(itertools.pairwise(height_scales)) or [(height_scales[0], height_scales[0])]
+        ranges: list[tuple[float, ...]] = [*itertools.pairwise(height_scales)] or [tuple(height_scales)]
         entries = MAX_INTERFACE_ENTRIES if self.transmits and not is_sheet else MAX_ENTRIES
         side_bins = np.sqrt(entries / (np.sqrt(len(ranges)) * self.slices * orders.prod()))
         self.side_bins = int(np.clip(side_bins, MIN_SIDE_BINS, MAX_SIDE_BINS))
@@ -97,8 +98,10 @@ class OrderSampler:
         borders = direction_borders(self.side_bins, 4)
         low, high = borders.min(1), borders.max(1)
         sums, bins, fractions, start = [], [], [], 0
+        furnace = Furnace.of(spectrum, 1.0, stack, laterals[0])
+        of_sides = {True: furnace, False: furnace.from_below()}
         for scales, above in itertools.product(ranges, sides):
-            furnaces = [Furnace.of(spectrum, scale, stack, 1 if above else -1, laterals[0]) for scale in scales]
+            furnaces = [replace(of_sides[above], height_scale=scale) for scale in scales]
             powers_of_sides = []
             for reflects in sides:
                 index = self._indices(above)[0] if reflects else abs(self.eta - 1)

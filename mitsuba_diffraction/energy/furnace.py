@@ -96,16 +96,14 @@ class Furnace:
         spectrum: PowerSpectrum,
         height_scale: float = 1.0,
         stack: Stack | None = None,
-        side: int = 1,
         lobe_scale: float = 1.0,
     ) -> Furnace:
-        """Return the components of `spectrum`.
+        """Return the components of `spectrum` for light from above.
 
         Args:
             spectrum: S(q; κ).
             height_scale: the factor of the heights.
             stack: the dielectric with its films, if light is transmitted.
-            side: 1 if ω is above the surface; −1 if below, where the surface has the heights −h and S(−q; κ).
             lobe_scale: the factor of the widths of lobes of orders.
         """
         grid, max_kappa = spectrum.grid, spectrum.max_kappa
@@ -126,19 +124,11 @@ class Furnace:
             q, widths, powers = _binned(spectrum, kappas, 1.0 if index is None else INTERFACE_BIN_FACTOR)
         kept = powers.max(-1) > 1e-7
         powers = np.ascontiguousarray(np.maximum(powers[kept], 0), np.float32)
-        relative_index = None if index is None else float(index) ** side
-        return cls(
-            spectrum,
-            relative_index,
-            by_order,
-            side * q[kept],
-            widths[kept],
-            powers,
-            height_scale,
-            lobe_scale,
-            stack,
-            side,
-        )
+        return cls(spectrum, index, by_order, q[kept], widths[kept], powers, height_scale, lobe_scale, stack)
+
+    def from_below(self) -> Furnace:
+        """Return the components for light from below, where the surface has the heights −h and S(−q; κ)."""
+        return replace(self, index=None if self.index is None else 1 / self.index, q=-self.q, side=-self.side)
 
     def at(self, wavelength: float, laterals: tuple[float, float] = (1.0, 1.0), step: float = 0.0) -> Furnace:
         """Return the components with the index and R and T of a plane at one wavelength, µm in the medium above.

@@ -216,8 +216,8 @@ class EnergyTable:
             stack: the dielectric with its films, if light is transmitted.
             laterals: bounds of s.
         """
-        above_and_below = (1,) if stack is None else (1, -1)
-        sides = [Furnace.of(spectrum, max(ratios), stack, side, laterals[0]) for side in above_and_below]
+        above = Furnace.of(spectrum, max(ratios), stack, laterals[0])
+        sides = [above] if stack is None else [above, above.from_below()]
         layout = Layout.of(sides[0], laterals)
         e = _bounds(layout, sides, ratios, layout.points(0.0), laterals).reshape(len(ratios), -1, *layout.shape)
         # e varies fast where an order is just above the horizon, and in deep reliefs. Where it is less at the centre of
