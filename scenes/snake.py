@@ -178,11 +178,13 @@ class Skin:
 
 SKINS = {
     # Corn snakes have 27 rows of weakly keeled scales, sunbeam snakes 15 of smooth ones, and a belly of wide plates.
-    "elaphe": Skin(rows=34, dome=0.16, tilt=0.05, roll=0.55, turn=5.0, wobble=0.02),
-    "xenopeltis": Skin(rows=22, dome=0.10, tilt=0.03, roll=0.5, turn=4.0, wobble=0.012),
+    "elaphe": Skin(rows=48, dome=0.16, tilt=0.05, roll=0.55, turn=5.0, wobble=0.02),
+    "xenopeltis": Skin(rows=32, dome=0.10, tilt=0.03, roll=0.5, turn=4.0, wobble=0.012),
 }
 BELLY = 0.13  # half the fraction of the circumference covered by the plates of the belly
-PITCH = 1.7  # of the scales along the body, in widths of a scale
+PITCH = 4.2  # of the scales of a row along the body, in distances of rows
+ELONGATION = 1.33
+ROUNDNESS = 6  # of the corners of scales: the order of a norm
 HEAD_PLATES = 3.3  # cm from the snout, covered by plates instead of scales
 MOUTH = 0.335  # from the back to the line of the mouth, as a fraction of the circumference
 
@@ -212,7 +214,7 @@ class Texels:
 
 
 def texels(sweep: Sweep, skin: Skin, columns: int) -> Texels:
-    """Return the scales: staggered rows along the body, each with its tip on the two behind it."""
+    """Return the scales: staggered rows along the body."""
     rows = columns // 8
     u = np.float32((np.arange(columns) + 0.5) / columns)[None, :]
     v = np.float32((np.arange(rows) + 0.5) / rows)[:, None]
@@ -220,30 +222,34 @@ def texels(sweep: Sweep, skin: Skin, columns: int) -> Texels:
     x = (1 - u) * np.float32(sweep.scale * skin.rows / (2 * np.pi))
     y = v * skin.rows
     shape = np.broadcast_shapes(x.shape, y.shape)
-    number, column, row = (np.zeros(shape, np.float32) for _ in range(3))
-    a, b, edge = (np.ones(shape, np.float32) for _ in range(3))
-    free = np.ones(shape, bool)
-    half_length = 0.62 * PITCH
-    # Of the scales that cover a texel, that nearest to the head is uppermost.
-    steps = [(along, across) for along in (-1.5, -1, -0.5, 0, 0.5, 1) for across in (-1, 0, 1)]
-    for along, across in steps:
-        j = np.floor(y) + across
+    # Scales are the hexagons of a staggered lattice, the points nearest to its sites in lengths that are ELONGATION
+    # times shorter along the body.
+    nearest, row, column, da, db = (np.full(shape, value, np.float32) for value in (np.inf, 0, 0, 0, 0))
+    for across in (-1, 0, 1):
+        j = np.floor(y) + np.float32(across)
         stagger = np.float32(0.5) * (j % 2)
-        if (along % 1 == 0.5) != (across != 0):
-            continue
-        i = np.floor(x / PITCH - 0.5 * (np.floor(y) % 2)) + np.float32(along - (0.5 if across else 0)) + 1
-        i = np.where((across != 0) & (stagger == 0), i + 1, i)
-        da = (x - (i + stagger) * PITCH) / half_length
-        db = (y - j - 0.5) / 0.95
-        rim = np.hypot(np.maximum(da, 0) ** 1.3, db)
-        on_top = free & (rim < 1) & (da > -1.6)
-        free &= ~on_top
-        for field, value in ((a, da), (b, db), (edge, rim), (row, j), (column, i + stagger)):
-            field[on_top] = np.broadcast_to(value, shape)[on_top]
-        number[on_top] = np.broadcast_to(i * 64 + j % skin.rows, shape)[on_top]
-    roll = skin.roll * smooth_step(edge, 0.78, 1.0)
-    toward_tail = skin.tilt - roll * np.maximum(a, 0)
-    slope_v = -skin.dome * b - roll * b
+        i = np.round(x / PITCH - stagger)
+        along = x - (i + stagger) * PITCH
+        distance = np.hypot(along / ELONGATION, y - j - 0.5)
+        closer = distance < nearest
+        for field, value in ((nearest, distance), (row, j), (column, i + stagger), (da, along), (db, y - j - 0.5)):
+            np.copyto(field, value, where=closer)
+    number = np.floor(column) * 64 + row % skin.rows
+    # The distance from the sides of the hexagon, 1 on them; its corners are round.
+    slant = np.array([PITCH / 2 / ELONGATION**2, 1], np.float32) / ((PITCH / 2 / ELONGATION) ** 2 + 1) * 2
+    sides = np.stack([np.abs(da) * slant[0] + np.abs(db) * slant[1], np.abs(db), np.abs(da) * np.float32(2 / PITCH)])
+    sides = np.maximum(sides, 1e-6)
+    edge = (sides**ROUNDNESS).sum(0) ** np.float32(1 / ROUNDNESS)
+    weights = (sides / edge) ** (ROUNDNESS - 1)
+    normal_x = np.sign(da) * (weights[0] * slant[0] + weights[2] * np.float32(2 / PITCH))
+    normal_y = np.sign(db) * (weights[0] * slant[1] + weights[1])
+    # The tip lies on the scales behind it: its edge is higher than those of the root.
+    # The bottom of the groove is flat, so that slopes are continuous and filtered textures have smooth outlines.
+    into_groove = np.sin(np.pi * np.clip((edge - 0.6) / 0.4, 0, 1)) ** 2
+    roll = skin.roll * into_groove * (0.6 + 0.4 * da * np.float32(2 / PITCH))
+    length = np.hypot(normal_x, normal_y)
+    toward_tail = skin.tilt * (1 - smooth_step(edge, 0.6, 1.0)) - roll * normal_x / length
+    slope_v = -skin.dome * db * (1 - smooth_step(edge, 0.6, 1.0)) - roll * normal_y / length
     # The belly: plates as wide as it is, one for each scale along the body.
     belly = np.abs(v - 0.5) > 0.5 - BELLY
     i = np.floor(x / PITCH)
@@ -258,7 +264,7 @@ def texels(sweep: Sweep, skin: Skin, columns: int) -> Texels:
     back = np.where(belly, 0.5, np.abs((row + 0.5) / skin.rows - 0.5))
     s = np.interp(u, sweep.u, sweep.s)
     return _with_head_plates(
-        Texels(s, v, number.astype(int), column, back, -toward_tail, slope_v, np.where(free, 1, edge)), sweep
+        Texels(s, v, number.astype(int), column, back, -toward_tail, slope_v, np.minimum(edge, 1)), sweep
     )
 
 
@@ -403,7 +409,8 @@ def scales(folder: Path, name: str, sweep: Sweep, columns: int) -> Texels:
     tilt = [skin.wobble * per_scale(texture, seed) for seed in (1, 2)]
     normals = normals_from_slopes(texture.slope_u + tilt[0], texture.slope_v + tilt[1])
     write_numbers(folder / f"{name}_normals.exr", normals)
-    write_numbers(folder / f"{name}_turn.exr", skin.turn * per_scale(texture, 3))
+    # Half as many texels do: the direction changes in the grooves between scales.
+    write_numbers(folder / f"{name}_turn.exr", (skin.turn * per_scale(texture, 3))[::2, ::2])
     return texture
 
 
