@@ -21,10 +21,12 @@ from .tables import derivative_bound
 def phase_wave(heights: NDArray[np.float64], kappa: float) -> NDArray[np.complex64]:
     """Compute e^{iκh} in single precision, of the shape of the heights (µm); κ in rad/µm."""
     turns = heights * (kappa / (2 * np.pi))
-    # Whole turns are removed in double precision.
-    phase = (2 * np.pi * (turns - np.rint(turns))).astype(np.float32)
+    turns -= np.rint(turns)  # in double precision
+    phase = turns.astype(np.float32)
+    phase *= np.float32(2 * np.pi)
     wave = np.empty(heights.shape, np.complex64)
-    wave.real, wave.imag = np.cos(phase), np.sin(phase)
+    np.cos(phase, out=wave.real)
+    np.sin(phase, out=wave.imag)
     return wave
 
 
