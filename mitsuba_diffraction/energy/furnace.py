@@ -229,7 +229,7 @@ class Furnace:
             u = np.multiply.outer(length, q[near, k])
             square -= u * (u + 2 * s[:, k, None]) / index**2
         if not self.by_order:
-            return self._bin_terms(cos_i, length, near, np.sqrt(1 - square), branch)
+            return self._bin_terms(cos_i, length, near, np.sqrt(np.maximum(1 - square, 0)), branch)
         i, j = np.nonzero(square > 0)
         square, j = square[i, j], near[j]
         width = self.lobe_scale * self.spectrum.lobe_width
@@ -282,7 +282,7 @@ class Furnace:
         branch: int,
     ) -> tuple[Real, Real]:
         """Return the power at points r of bins of width σ about ρ and |λq|² = `tangent`, and |ω_i·h|."""
-        index, square = (branch and self.index) or 1.0, 1 - cos_i**2
+        index, square = (branch and self.index) or 1.0, np.maximum(1 - cos_i**2, 0)
         # |λq|² along the line from the centre of the hemisphere; the component of ω_∥ along it is at most sin θ_i.
         max_along = 2 * index * np.sqrt(square)
         along = np.clip((index**2 * rho**2 + square - tangent) / np.maximum(rho, 1e-12), -max_along, max_along)

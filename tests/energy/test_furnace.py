@@ -154,3 +154,14 @@ def test_the_mean_cosine_of_a_lobe_far_from_the_horizon_is_that_of_its_centre():
     density = np.sqrt(np.e) * horizon_gain(y) * np.exp(-(y**2) / 2) / np.sqrt(2 * np.pi)
     expected = np.trapezoid(density * np.sqrt(y / 2), y) * np.sqrt(2 * sigma)
     np.testing.assert_allclose(mean_cosine(0.0, sigma), expected, rtol=1e-3)
+
+
+def test_light_that_a_bin_diffracts_along_the_normal_has_an_albedo():
+    noise = np.random.default_rng(3).normal(size=(128, 128)) * 0.02
+    furnace = Furnace.of(md.precompute(md.HeightField(noise, 0.08), coherence_length=4.0))
+    assert not furnace.by_order
+    tangent = -0.5 * furnace.q[np.hypot(*furnace.q.T) < 1.9]
+    omega = np.column_stack([tangent, np.sqrt(1 - (tangent**2).sum(-1))])
+    with np.errstate(all="raise", under="ignore"):
+        found = furnace.albedo(omega, np.full(len(omega), 0.5))
+    assert np.isfinite(found).all()
