@@ -17,8 +17,7 @@ from scipy.special import j1
 
 import mitsuba_diffraction as md
 from mitsuba_diffraction import hologram as gratings_of
-from mitsuba_diffraction.render import render
-from mitsuba_diffraction.render import scene as of_scenes
+from mitsuba_diffraction.render import parsed_scene, render
 from mitsuba_diffraction.render.scene import load_spectral_scene
 
 ROOT = Path(__file__).parents[1]
@@ -215,12 +214,12 @@ def test_models_are_made_when_a_scene_is_first_read(tmp_path, monkeypatch):
     texture = '<texture type="bitmap" id="t"><string name="filename" value="models/a.png"/></texture>'
     scene = own / "scene.xml"
     scene.write_text(f'<scene version="3.0.0"><!-- made by: python scenes/disc.py -->{texture}</scene>')
-    monkeypatch.setattr(of_scenes, "examples_folder", lambda: package.parent)
-    assert scene in of_scenes.files_of_scene(scene)
+    monkeypatch.setattr(parsed_scene, "examples_folder", lambda: package.parent)
+    assert scene in parsed_scene.files_of_scene(scene)
     assert [(own / "models" / f"{name}.png").read_text() for name in "ab"] == ["a", "mine"]
     scene.write_text(scene.read_text().replace("a.png", "c.png"))
     with pytest.raises(ValueError, match=r"models/c.png: no such file; it is made by: python scenes/disc.py"):
-        of_scenes.files_of_scene(scene)
+        parsed_scene.files_of_scene(scene)
 
 
 # ---------------------------------------------------------------- the beetle

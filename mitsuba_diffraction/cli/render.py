@@ -110,8 +110,8 @@ def render(
 
     from ..llvm import choose_variant
     from ..render.cluster import trace_on
+    from ..render.parsed_scene import files_of_scene, has_alpha, named_sample_count
     from ..render.passes import checkpoint_path, trace_locally
-    from ..render.scene import files_of_scene, has_alpha, named_sample_count
     from ..render.turntable import animations_of, save_animation
     from ..render.turntable import orbit as motions_of_orbit
 

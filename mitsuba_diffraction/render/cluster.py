@@ -23,8 +23,8 @@ from numpy.typing import NDArray
 
 from ..errors import RequestError
 from .film import LightOfBands
+from .parsed_scene import scene_digest
 from .passes import Job, Tracer, trace_band, versions
-from .scene import scene_digest
 
 # Held while a pass is traced: it uses all threads of Dr.Jit, and two at a time would only need more memory.
 pass_lock = threading.Lock()

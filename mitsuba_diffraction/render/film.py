@@ -23,10 +23,12 @@ import mitsuba as mi
 import numpy as np
 from numpy.typing import NDArray
 
+from ..bsdf.light import recorded_wavelengths
 from ..errors import RequestError, root_cause
 from ..integrator.paths import LightPaths, random_numbers, unpacked
 from ..progress import bytes_text
-from .scene import channel_wavelengths, channel_weights, no_warnings, recorded_range, recorded_wavelengths
+from .scene import no_warnings, recorded_range
+from .scene_film import channel_wavelengths, channel_weights
 
 Rows = tuple[int, int]
 """The first row of a band of a picture, and the row after its last."""

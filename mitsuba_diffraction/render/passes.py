@@ -52,17 +52,11 @@ from .film import (
     sampler_of,
     trace_pass,
 )
-from .scene import (
-    Materials,
-    SpectralRange,
-    channel_wavelengths,
-    has_alpha,
-    load_spectral_scene,
-    max_plausible_luminance,
-    recorded_range,
-    scene_digest,
-    warn_of_gratings,
-)
+from .parsed_scene import has_alpha, scene_digest
+from .scene import load_spectral_scene, recorded_range, warn_of_gratings
+from .scene_film import SpectralRange, channel_wavelengths
+from .scene_light import max_plausible_luminance
+from .scene_materials import Materials
 from .spectral_image import SpectralImage, split_rows
 
 _log = logging.getLogger(__name__)

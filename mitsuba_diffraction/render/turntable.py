@@ -18,7 +18,8 @@ from scipy.spatial.transform import Rotation
 
 from ..files import encoded_file, whole_file
 from ..outputs import MARK
-from .scene import Materials, load_spectral_scene
+from .scene import load_spectral_scene
+from .scene_materials import Materials
 
 if TYPE_CHECKING:
     from PIL import Image

@@ -21,7 +21,7 @@ from mitsuba_diffraction.inverse_design import Design, makers, output
 from mitsuba_diffraction.inverse_design.plate import Plate
 from mitsuba_diffraction.inverse_design.target import wanted_fractions
 from mitsuba_diffraction.outputs import check_outputs
-from mitsuba_diffraction.render.scene import files_of_scene
+from mitsuba_diffraction.render.parsed_scene import files_of_scene
 from mitsuba_diffraction.render.spectral_image import SpectralImage, save_preview
 from mitsuba_diffraction.render.turntable import save_animation
 from mitsuba_diffraction.spectrum import exr

@@ -19,7 +19,7 @@ from mitsuba_diffraction.evaluation.comparison.pictures import NO_SHADOWS, Pictu
 from mitsuba_diffraction.evaluation.comparison.quirk_shares import quirk_shares
 from mitsuba_diffraction.evaluation.realtime_shader.evaluate import VARIANTS
 from mitsuba_diffraction.evaluation.realtime_shader.quirks import Quirks
-from mitsuba_diffraction.render.scene import channel_wavelengths, channel_weights
+from mitsuba_diffraction.render.scene_film import channel_wavelengths, channel_weights
 
 # A sphere above a plate, with a pigment; broad lobes, so that small pictures resolve them.
 GRATING = """<bsdf type="diffraction_grating"><string name="profile" value="{profile}"/>

@@ -12,7 +12,8 @@ from bsdf_support import bitmap, grating, uniform, use
 import mitsuba_diffraction  # noqa: F401 (settles which LLVM is used before a variant is set)
 from mitsuba_diffraction.render import scene as scene_module
 from mitsuba_diffraction.render.film import trace_pass
-from mitsuba_diffraction.render.scene import channel_weights, load_spectral_scene
+from mitsuba_diffraction.render.scene import load_spectral_scene
+from mitsuba_diffraction.render.scene_film import channel_weights
 
 SUN = {"type": "directional", "direction": [0, 0.6, -0.8], "irradiance": uniform(1.0)}
 SKY = {"type": "constant", "radiance": uniform(0.05)}
@@ -457,7 +458,7 @@ def test_both_halves_draw_the_lines_of_a_lamp(llvm, tmp_path, monkeypatch):
 
     found = np.array(list(pictures()))
     # Drawn by the response of the film alone they have the same mean and far more noise.
-    monkeypatch.setattr(scene_module, "_draw_wavelengths_of_lights", lambda built: None)
+    monkeypatch.setattr(scene_module, "draw_wavelengths_of_lights", lambda built: None)
     wanted = np.array(list(pictures()))
     error = np.std(wanted, 0, ddof=1) / np.sqrt(len(wanted))
     np.testing.assert_array_less(np.abs(found.mean(0) - wanted.mean(0)), 4 * error)

@@ -19,7 +19,8 @@ from mitsuba_diffraction.color import spectrum_to_XYZ
 from mitsuba_diffraction.render import SpectralImage, film, passes, render
 from mitsuba_diffraction.render.film import LightOfBands, bands_of, trace_pass
 from mitsuba_diffraction.render.passes import BandedImage, Interrupted, trace_locally
-from mitsuba_diffraction.render.scene import channel_wavelengths, load_spectral_scene
+from mitsuba_diffraction.render.scene import load_spectral_scene
+from mitsuba_diffraction.render.scene_film import channel_wavelengths
 from mitsuba_diffraction.render.spectral_image import save_preview
 
 # A grating in the sun in front of a wall, and of a crop window of 12 × 10 pixels.

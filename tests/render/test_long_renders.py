@@ -20,6 +20,7 @@ import mitsuba_diffraction  # noqa: F401 (settles which LLVM is used before a va
 from mitsuba_diffraction.color import spectrum_to_XYZ
 from mitsuba_diffraction.files import exclusive
 from mitsuba_diffraction.render import SpectralImage, passes, render
+from mitsuba_diffraction.render.parsed_scene import scene_digest
 from mitsuba_diffraction.render.passes import (
     Accumulation,
     Interrupted,
@@ -27,7 +28,8 @@ from mitsuba_diffraction.render.passes import (
     load_checkpoint,
     save_checkpoint,
 )
-from mitsuba_diffraction.render.scene import channel_wavelengths, load_spectral_scene, scene_digest
+from mitsuba_diffraction.render.scene import load_spectral_scene
+from mitsuba_diffraction.render.scene_film import channel_wavelengths
 from mitsuba_diffraction.render.spectral_image import save_preview, stored_digest
 from mitsuba_diffraction.render.turntable import orbit
 

@@ -12,14 +12,8 @@ from bsdf_support import made_up
 
 from mitsuba_diffraction.cli.arguments import materials_of
 from mitsuba_diffraction.render import render
-from mitsuba_diffraction.render.scene import (
-    files_of_scene,
-    has_uvs,
-    load_spectral_scene,
-    parsed,
-    scene_digest,
-    warn_of_gratings,
-)
+from mitsuba_diffraction.render.parsed_scene import files_of_scene, parsed, scene_digest
+from mitsuba_diffraction.render.scene import has_uvs, load_spectral_scene, warn_of_gratings
 
 MIRROR = {"profile": "blazed", "period": 2.0, "depth": 0.2, "material": "none", "conserve_energy": False}
 PLAIN = "".join(

@@ -17,7 +17,8 @@ from mitsuba_diffraction.color import spectrum_to_linear_sRGB, spectrum_to_XYZ
 from mitsuba_diffraction.errors import Bug, RequestError
 from mitsuba_diffraction.render import film, passes, render
 from mitsuba_diffraction.render.film import trace_pass
-from mitsuba_diffraction.render.scene import channel_wavelengths, channel_weights, load_spectral_scene
+from mitsuba_diffraction.render.scene import load_spectral_scene
+from mitsuba_diffraction.render.scene_film import channel_wavelengths, channel_weights
 from mitsuba_diffraction.render.spectral_image import save_preview
 
 GRID = channel_wavelengths()

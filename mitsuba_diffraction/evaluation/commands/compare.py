@@ -57,7 +57,7 @@ def compare(
     import mitsuba as mi
 
     from ...llvm import choose_variant
-    from ...render.scene import files_of_scene
+    from ...render.parsed_scene import files_of_scene
     from ..comparison import compare as run
     from ..comparison import summary
     from ..comparison.pictures import supported_lights

@@ -45,7 +45,7 @@ def convergence(
     import mitsuba as mi
 
     from ...llvm import choose_variant
-    from ...render.scene import files_of_scene
+    from ...render.parsed_scene import files_of_scene
     from ..comparison import convergence as study
     from ..comparison import series
 

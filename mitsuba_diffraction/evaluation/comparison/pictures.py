@@ -20,8 +20,10 @@ from ...errors import RequestError
 from ...progress import Progress, part, silent
 from ...render import SpectralImage
 from ...render.film import check_memory, collect, equal_ranges, pass_seed, rotated_sampler, sampler_of, trace_pass
+from ...render.parsed_scene import parsed
 from ...render.passes import Accumulation, ratio, split
-from ...render.scene import channel_wavelengths, load_spectral_scene, parsed, recorded_range
+from ...render.scene import load_spectral_scene, recorded_range
+from ...render.scene_film import channel_wavelengths
 from ...settings import VISIBLE
 from ..realtime_shader import tristimulus
 from ..realtime_shader.diffraction_shader import PUBLISHED_BRIGHTNESS, checked_brightness, parameters_of_variant

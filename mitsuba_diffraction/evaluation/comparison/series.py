@@ -28,7 +28,8 @@ from ...progress import Progress, no_progress
 from ...render import SpectralImage
 from ...render.film import pass_seed, trace_pass
 from ...render.passes import Accumulation, split
-from ...render.scene import channel_wavelengths, load_spectral_scene
+from ...render.scene import load_spectral_scene
+from ...render.scene_film import channel_wavelengths
 from ...settings import ORIGINS, SERIES, ScalarSettings
 from ..realtime_shader.surfaces import gratings_of
 from .difference import as_shown, white_luminance
