@@ -57,7 +57,7 @@ def random_surface(seed):
         length = np.exp(rng.uniform(0, np.log(12), 1))[0]
         h = gaussian_filter(h, [min(length, n / 4) if n > 1 else 0 for n in shape], mode="wrap")
     h = (h - h.min()) / max(np.ptp(h), 1e-12) * height
-    coherence_length = np.exp(rng.uniform(np.log(0.3), np.log(300)))
+    coherence_length = max(np.exp(rng.uniform(np.log(0.3), np.log(300))), 0.36)  # shorter ones are refused
     extent = "sample" if rng.random() < 0.5 and shape[0] > 1 else "tile"
     return md.HeightField(h, pixel), {"extent": extent, "coherence_length": coherence_length}
 
