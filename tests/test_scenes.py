@@ -317,7 +317,8 @@ def test_snake_wears_scales(scales, name):
     assert np.mean(texels.edge[:, body] < 0.8) > 0.4
     column = texels.number[:, np.flatnonzero(body)[0]]
     rows = 1 + np.count_nonzero(np.diff(column))
-    assert 0.6 * skin.rows < rows < 1.2 * skin.rows
+    # A line round the body crosses every second row of the staggered hexagons, and some of those between.
+    assert 0.4 * skin.rows < rows < skin.rows
     # The back's scales rise towards their tips, and both sides of the back are alike.
     assert np.abs(texels.slope_v[:, body].mean()) < 0.02
     normals = 2 * snake.normals_from_slopes(texels.slope_u, texels.slope_v) - 1
