@@ -18,13 +18,14 @@ from pathlib import Path
 import numpy as np
 import OpenEXR
 from numpy.typing import NDArray
-from PIL import Image, UnidentifiedImageError
+from PIL import Image
 from scipy.special import j1, jnp_zeros
 
 from .color import spectrum_to_linear_sRGB
 from .errors import RequestError
 from .files import whole_file
 from .outputs import MARK
+from .picture_file import read_picture
 
 PERIOD, DEPTH = 1.5, 0.25  # µm, as in hologram.xml
 SIZE = 16.0, 9.0  # cm, of the hologram
@@ -79,20 +80,21 @@ def fitted(picture: str | os.PathLike[str], columns: int) -> Array:
 
     Raises:
         FileNotFoundError: if there is no such file.
-        RequestError: if it is no picture.
+        RequestError: if it is no picture, or a black one.
     """
     size = columns, round(columns * SIZE[1] / SIZE[0])
-    try:
-        with Image.open(picture) as image:
-            opaque = Image.alpha_composite(Image.new("RGBA", image.size, "black"), image.convert("RGBA")).convert("RGB")
-    except UnidentifiedImageError:
-        raise RequestError(f"{picture}: got no picture, wanted one, such as .png or .jpg") from None
-    factor = min(wanted / given for wanted, given in zip(size, opaque.size, strict=True))
-    inner = opaque.resize([max(1, round(factor * length)) for length in opaque.size], Image.Resampling.LANCZOS)
-    canvas = Image.new("RGB", size)
-    canvas.paste(inner, ((size[0] - inner.width) // 2, (size[1] - inner.height) // 2))
-    srgb = np.asarray(canvas, np.float64) / 255
-    return np.where(srgb <= 0.04045, srgb / 12.92, ((srgb + 0.055) / 1.055) ** 2.4)
+    radiance = np.atleast_3d(read_picture(Path(picture)))
+    if radiance.max() <= 0:
+        raise RequestError(f"{picture}: got a black picture, wanted light in it")
+    factor = min(wanted / given for wanted, given in zip(size, radiance.shape[1::-1], strict=True))
+    inner = [max(1, round(factor * length)) for length in radiance.shape[1::-1]]
+    channels = [Image.fromarray(np.float32(channel)) for channel in np.moveaxis(radiance, -1, 0)]
+    # LANCZOS overshoots.
+    fine = [np.clip(channel.resize(inner, Image.Resampling.LANCZOS), 0, 1) for channel in channels]
+    canvas = np.zeros((size[1], size[0], 3))
+    x, y = (size[0] - inner[0]) // 2, (size[1] - inner[1]) // 2
+    canvas[y : y + inner[1], x : x + inner[0]] = np.stack(fine, -1)
+    return canvas
 
 
 def textures_in(folder: Path) -> list[Path]:

@@ -192,7 +192,8 @@ def progress_bar(label: str, unit: str = "", begin: str = "") -> Iterator[Callab
 
         waiting = threading.Timer(_MIN_REPORTED_SECONDS, _say_stage, (label, len(_stages), counted))
         waiting.daemon = True
-        waiting.start()
+        if not begin:
+            waiting.start()
         try:
             yield show_in_log
         finally:

@@ -53,7 +53,7 @@ from .materials import is_file
 from .precomputation import Spectrum, build_spectrum, build_versions, is_rigorous, load_spectrum
 from .progress import Progress, no_progress, part, silent, stage
 from .settings import SPECTRUM_PARAMETERS, ScalarSettings, Settings
-from .surface.gratings import COHERENCE_LENGTHS, PATCHES, PROFILES, RENAMED, profile_name
+from .surface.gratings import COHERENCE_LENGTHS, PATCHES, PROFILES, profile_name
 from .surface.heightfield import HeightField
 from .surface.prepare import apply_steps, check_steps
 from .surface.readers import read_height_field
@@ -93,23 +93,14 @@ def source_named(name: str) -> str:
 
     Raises:
         RequestError: if the name has no suffix, and there is no such file, profile or recipe.
-
-    Warns:
-        FutureWarning: if the name was that of another surface.
     """
-    if name in PROFILES or Path(name).suffix or os.path.exists(name):
+    if name in PROFILES or Path(name).suffix or os.path.isfile(name):
         return name
     recipes = {path.stem: path for path in sorted((examples_folder() / "precompute").glob("*.toml"))}
     if name not in recipes:
         similar = did_you_mean(name, [*PROFILES, *recipes])
         wanted = similar or f", wanted {', '.join(dict.fromkeys([*PROFILES, *recipes]))}, or a file"
         raise RequestError(f"{name}: no file and no surface has this name{wanted}")
-    if name in RENAMED:
-        warnings.warn(
-            f"{name}: the measured skin; the synthetic one, which had this name until version 0.2, is {RENAMED[name]}",
-            FutureWarning,
-            stacklevel=2,
-        )
     return str(recipes[name])
 
 

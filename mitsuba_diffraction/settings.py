@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import inspect
 import math
+import os
 from collections.abc import Callable
 from dataclasses import dataclass, fields
 from typing import Any, ClassVar, cast
@@ -314,3 +315,9 @@ def matching(q: ArrayLike, kappa: ArrayLike) -> tuple[NDArray[np.float64], NDArr
             f"kappa: got shape {kappa.shape}, which does not broadcast with q of shape {q.shape}"
         ) from None
     return np.broadcast_to(q, (*shape, 2)), np.broadcast_to(kappa, shape)
+
+
+def usable_cores() -> int:
+    """Return the number of threads that compute at once: of the cores of this process at most eight, for the memory."""
+    affinity = getattr(os, "sched_getaffinity", None)
+    return min(len(affinity(0)) if affinity else os.cpu_count() or 1, 8)

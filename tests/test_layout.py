@@ -24,7 +24,7 @@ MODULES = {
 
 LEVELS = {
     # The lowest first: modules of a level import from the levels above it in this list, and from their own.
-    "base": "color errors files geometry llvm manual materials outputs progress settings film_stack",
+    "base": "color errors files film_stack geometry llvm manual materials outputs picture_file progress settings",
     "surface": "surface",
     "spectrum": "spectrum",
     "energy": "energy",

@@ -17,6 +17,7 @@ from scipy.special import j1
 
 import mitsuba_diffraction as md
 from mitsuba_diffraction import hologram as gratings_of
+from mitsuba_diffraction.recipe import Recipe
 from mitsuba_diffraction.render import parsed_scene, render
 from mitsuba_diffraction.render.scene import load_spectral_scene
 
@@ -197,7 +198,7 @@ def test_a_picture_keeps_its_proportions_in_the_middle_of_the_hologram(tmp_path)
     for path, values in zip(gratings_of.textures_in(tmp_path), (lateral, heights), strict=False):
         # Mitsuba reads the first row of the file at v = 0, the bottom of the card.
         np.testing.assert_allclose(np.squeeze(mi.Bitmap(str(path))), values[::-1], rtol=1e-3, atol=1e-4)
-    with pytest.raises(ValueError, match="got no picture, wanted one"):
+    with pytest.raises(ValueError, match="not a picture that can be read"):
         gratings_of.fitted(SCENES / "hologram.xml", 64)
 
 
@@ -206,8 +207,12 @@ def test_models_are_made_when_a_scene_is_first_read(tmp_path, monkeypatch):
     package, own = tmp_path / "package" / "scenes", tmp_path / "scenes"
     package.mkdir(parents=True)
     (package / "disc.py").write_text(
-        "def make(folder):\n    for name in 'ab':\n        (folder / f'{name}.png').write_text(name)\n"
+        "import random\ndef make(folder):\n    for name in 'ab':\n        (folder / f'{name}.png').write_text(name)\n"
     )
+    # The modules of the folder in which the program is started are the user's.
+    monkeypatch.chdir(tmp_path)
+    Path("random.py").write_text("raise SystemExit('nor this')")
+    Path("pathlib.py").write_text("raise SystemExit('nor this')")
     (own / "models").mkdir(parents=True)
     (own / "disc.py").write_text("raise SystemExit('this must not run')")
     (own / "models" / "b.png").write_text("mine")
@@ -220,6 +225,37 @@ def test_models_are_made_when_a_scene_is_first_read(tmp_path, monkeypatch):
     scene.write_text(scene.read_text().replace("a.png", "c.png"))
     with pytest.raises(ValueError, match=r"models/c.png: no such file; it is made by: python scenes/disc.py"):
         parsed_scene.files_of_scene(scene)
+
+
+def test_a_scene_names_every_script_that_makes_its_files(tmp_path, monkeypatch):
+    shutil.copytree(SCENES, tmp_path / "scenes", ignore=shutil.ignore_patterns("models", "out", "gallery.npz"))
+    (tmp_path / "precompute").symlink_to(ROOT / "precompute")
+    monkeypatch.setattr(parsed_scene, "_make_models", lambda scripts, folder: None)
+    found = 0
+    for path in (tmp_path / "scenes").glob("*.xml"):
+        text = path.read_text()
+        if "made by:" not in text:
+            continue
+        commands = " ".join(text.partition("made by:")[2].split()).partition(" -->")[0]
+        wanted = re.match(r"(?:python scenes/\w+\.py(?: && )?)+", commands)[0]
+        with pytest.raises(ValueError, match="it is made by: ") as raised:
+            parsed_scene.files_of_scene(path)
+        assert str(raised.value).endswith(wanted.strip(" &"))
+        found += 1
+    assert found > 6
+
+
+def test_a_surface_by_its_name_is_part_of_the_scenes_digest(tmp_path, monkeypatch):
+    scene = tmp_path / "scene.xml"
+    scene.write_text(
+        '<scene version="3.0.0"><bsdf type="diffraction_grating" id="g">'
+        '<string name="filename" value="elaphe_afm"/></bsdf></scene>'
+    )
+    names = {path.name for path in parsed_scene.files_of_scene(scene)}
+    assert {"elaphe_afm.toml", "elaphe_afm_100x100.png"} <= names
+    before = parsed_scene.scene_digest(scene)
+    monkeypatch.setattr(Recipe, "digest", lambda recipe: "another")
+    assert parsed_scene.scene_digest(scene) != before
 
 
 # ---------------------------------------------------------------- the beetle

@@ -19,7 +19,7 @@ from ..files import refuse_other_than_utf8
 from ..progress import say
 from ..recipe import Recipe, source_named
 from ..settings import SPECTRUM_PARAMETERS, SUN_COHERENCE_LENGTH, Settings
-from ..surface.gratings import PROFILES
+from ..surface.gratings import PROFILES, RENAMED
 from ..surface.prepare import STEP_NAMES, step_of
 
 _MAX_VALUES = 10_000  # of a range first:last:step
@@ -69,13 +69,15 @@ def surface_of(text: str) -> tuple[str, dict[str, Value]]:
         if not (name and equals and value) or name in values:
             raise RequestError(f"{text}: got {name + equals + value!r}, wanted name=value, each name once")
         values[name] = converted(value)
+    if source in RENAMED:
+        say("note", f"{source}: the measured skin; the synthetic one, which had this name, is {RENAMED[source]}")
     return source_named(source), values
 
 
 def is_scan(source: str) -> bool:
     """Return whether a source is a scan, not a recipe (.toml), a saved spectrum (.exr) or a profile."""
     path = Path(source)
-    is_file = bool(path.suffix) or path.exists()
+    is_file = bool(path.suffix) or path.is_file()
     return is_file and source not in PROFILES and path.suffix.lower() not in (".toml", ".exr")
 
 

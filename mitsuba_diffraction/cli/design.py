@@ -8,16 +8,15 @@ from typing import Annotated
 import numpy as np
 import typer
 from numpy.typing import NDArray
-from PIL import Image, ImageOps
 
 from ..errors import RequestError
-from ..files import refuse_special
 from ..inverse_design import Design, Verdict, makers
 from ..inverse_design import design as search
 from ..inverse_design.output import SUFFIXES, save
 from ..inverse_design.plate import for_detail
 from ..inverse_design.search import WHITE
 from ..outputs import check_outputs, free_name
+from ..picture_file import read_picture
 from ..progress import progress_bar, say, show, table, tell
 from .arguments import Overwrite, check_suffix, converted, parse_numbers
 from .render import Stopped
@@ -70,7 +69,7 @@ def design(
     default = free_name(f"{target.stem}_relief", lambda stem: [Path(stem + suffix) for suffix in SUFFIXES], [target])
     path = output or Path(f"{default}.gsf")
     check_suffix("-o", path, ".gsf", ".tif")
-    picture = read_target(target, invert=invert)
+    picture = read_picture(target, invert=invert)
     exports = makers.export_paths(export or [], path)
     if "gds" in exports:
         makers.check_gds(levels)
@@ -130,42 +129,6 @@ def design(
 def _say_time(seconds: float) -> None:
     if seconds > _MIN_SAID_TIME:
         say("note", f"about {seconds / 60:.0f} min; Ctrl-C ends the search and keeps the best relief so far")
-
-
-def read_target(path: Path, invert: bool = False) -> NDArray[np.float64]:
-    """Return linear radiance from 0 to 1, (rows, columns) or (rows, columns, 3), of a picture in sRGB.
-
-    What is transparent is dark. With `invert`, what is opaque has the radiance of the negative.
-
-    Raises:
-        FileNotFoundError: if there is no such file.
-        ValueError: if it is not an opaque picture.
-    """
-    refuse_special(path)
-    try:
-        with Image.open(path) as opened:
-            image = ImageOps.exif_transpose(opened)
-            # Pillow opens PGM files of 16 bits, and older versions PNG files, as integers of 32 bits.
-            if image.mode == "F" or (image.mode == "I" and opened.format not in ("PNG", "PPM")):
-                raise RequestError(f"{path}: got numbers of 32 bits, wanted a picture of 8 or 16 bits per channel")
-            alpha: NDArray[np.float64] | float = 1.0
-            if image.mode.endswith(("A", "a")) or "transparency" in image.info:
-                alpha = np.asarray(image.convert("RGBA"), np.float64)[..., 3] / 255
-            if image.mode.startswith("I"):
-                encoded = np.asarray(image, np.float64) / 65535
-            else:
-                encoded = np.asarray(image.convert("L" if image.mode in ("1", "L", "LA") else "RGB"), np.float64) / 255
-    except (OSError, SyntaxError, ValueError, Image.DecompressionBombError) as error:
-        if isinstance(error, RequestError) or getattr(error, "errno", None):
-            raise
-        raise RequestError(f"{path}: not a picture that can be read ({error})") from None
-    if encoded.ndim == 3 and (encoded == encoded[..., :1]).all():
-        encoded = encoded[..., 0]
-    if invert:
-        encoded = 1 - encoded
-    # IEC 61966-2-1.
-    linear = np.where(encoded <= 0.04045, encoded / 12.92, ((encoded + 0.055) / 1.055) ** 2.4)
-    return linear * (alpha if encoded.ndim == 2 or isinstance(alpha, float) else alpha[..., None])
 
 
 def _is_dark_on_light(picture: NDArray[np.float64]) -> bool:

@@ -9,6 +9,7 @@ from typing import Annotated
 import typer
 
 from .. import hologram as of_picture
+from ..errors import RequestError
 from ..files import examples_folder, whole_file
 from ..outputs import MARK, check_outputs
 from ..progress import progress_bar, tell
@@ -28,15 +29,21 @@ def hologram(
     models, scene, preview = folder / "models", folder / "hologram.xml", folder / "hologram.png"
     textures = of_picture.textures_in(models)
     of_picture.fitted(picture, 16)  # refused before a folder is made
+    made = [path for path in (folder, models) if not path.exists()]
     models.mkdir(parents=True, exist_ok=True)
-    check_outputs([picture], [("-o", path) for path in (*textures, scene, preview)], overwrite=overwrite)
+    try:
+        check_outputs([picture], [("-o", path) for path in (*textures, scene, preview)], overwrite=overwrite)
+    except RequestError:
+        for path in reversed(made):
+            path.rmdir()
+        raise
     with progress_bar(f"gratings of {picture.name}", "", "computing"):
         lateral, heights, _ = of_picture.write(picture, models)
     text = (examples_folder() / "scenes" / "hologram.xml").read_text(encoding="utf-8")
-    made = f"{MARK}; its stone is made by: python scenes/ground.py"
+    maker = f"{MARK}; its stone is made by: python scenes/ground.py"
     with whole_file(scene) as temporary:
         temporary.write_text(
-            re.sub(r"Its textures are made by:\s+python .*\.py", made, text, count=1), encoding="utf-8"
+            re.sub(r"Its textures are made by:\s+python .*\.py", maker, text, count=1), encoding="utf-8"
         )
     periods = f"{of_picture.PERIOD * lateral.min():.2f} to {of_picture.PERIOD * lateral.max():.2f} µm"
     tell(

@@ -40,7 +40,6 @@ import base64
 import binascii
 import dataclasses
 import itertools
-import os
 import zlib
 from collections.abc import Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
@@ -52,6 +51,7 @@ from numpy.typing import NDArray
 
 from ..errors import RequestError
 from ..film_stack import MAX_PHASE_STEP, Stack
+from ..settings import usable_cores
 from ..spectrum.grids import OrderGrid
 from ..spectrum.power_spectrum import PowerSpectrum
 from .furnace import MAX_E, Furnace, Real
@@ -302,7 +302,7 @@ def _bounds(
         return np.concatenate(bounds)
 
     pairs = list(itertools.product(range(len(ratios)), slices))
-    with ThreadPoolExecutor(os.cpu_count()) as pool:
+    with ThreadPoolExecutor(usable_cores()) as pool:
         for (k, slice_), bounds in zip(
             pairs, pool.map(lambda pair: of_slice(ratios[pair[0]], pair[1]), pairs), strict=True
         ):

@@ -92,12 +92,12 @@ def files_of_scene(
     """
     with parsed(path, parameters, materials) as (_, state):
         texts = [
-            node.props[key]
+            _file_named(node, key)
             for node in state.nodes
             for key in node.props.keys()  # noqa: SIM118 (no mapping; items() fails before a variant is set)
             if node.props.type(key) == mi.Properties.Type.String
         ]
-        named = [resolved_file(name) for name in [*state.files, *texts]]
+        named = [*map(resolved_file, state.files), *texts]
     found = [file for file in named if file.is_file()]
     return [*found, *(scan for file in found if file.suffix.lower() == ".toml" for scan in Recipe.load(file).files)]
 
@@ -119,11 +119,12 @@ def _refuse_missing_files(path: Path, state: mi.parser.ParserState) -> None:
         if resolved_file(name).is_file():
             continue
         text = path.read_text(encoding="utf-8", errors="replace")
-        made = re.search(r"made by:\s+(python \S+\.py(?: && python \S+\.py)*)", text)
+        made = re.search(r"made by:\s+(python\s+\S+\.py(?:\s+&&\s+python\s+\S+\.py)*)", text)
         if made and Path(name).parent == Path("models"):
             _make_models(re.findall(r"scenes/(\w+)\.py", made[1]), path.resolve().parent / "models")
         if not resolved_file(name).is_file():
-            raise RequestError(f"{name}: no such file" + (f"; it is made by: {made[1]}" if made else ""))
+            maker = f"; it is made by: {' '.join(made[1].split())}" if made else ""
+            raise RequestError(f"{name}: no such file{maker}")
 
 
 def _make_models(scripts: list[str], folder: Path) -> None:
@@ -135,7 +136,8 @@ def _make_models(scripts: list[str], folder: Path) -> None:
     scripts = [script for script in scripts if (scenes / f"{script}.py").is_file()]
     for script in scripts:
         with progress_bar(f"models by {script}.py", "", "made once"), TemporaryDirectory() as made:
-            program = f"import sys, pathlib; sys.path.insert(0, sys.argv[1]); import {script}\n"
+            # Without the current folder, whose modules are the user's.
+            program = f"import sys; sys.path[:] = [sys.argv[1], *filter(None, sys.path)]; import pathlib, {script}\n"
             program += f"{script}.make(pathlib.Path(sys.argv[2]))"
             done = subprocess.run([sys.executable, "-c", program, str(scenes), made], capture_output=True, text=True)
             if done.returncode:
@@ -171,6 +173,14 @@ def _of_first_sensor(state: mi.parser.ParserState, kind: mi.ObjectType) -> list[
     return [mi.Properties(state.nodes[k].props) for k in children]
 
 
+def _file_named(node: mi.parser.SceneNode, name: str) -> Path:
+    """Return the file that a text of a plugin names, if there is one: also that of a surface by its name."""
+    text = node.props[name]
+    if name == "filename" and node.props.plugin_name() == "diffraction_grating":
+        return Path(source_named(str(resolved_file(text))))
+    return resolved_file(text)
+
+
 def scene_digest(
     path: str | os.PathLike[str], parameters: Mapping[str, str] | None = None, materials: Materials | None = None
 ) -> str:
@@ -183,7 +193,7 @@ def scene_digest(
         for node in state.nodes:
             content.update(f"{node.props.plugin_name()}\n".encode())
             for name, value in node.props.items():
-                named = resolved_file(value) if isinstance(value, str) else None
+                named = _file_named(node, name) if isinstance(value, str) else None
                 if named is None or not named.is_file():
                     content.update(f"{name}={_exact_text(value)}\n".encode())
                 elif named.suffix.lower() == ".toml":

@@ -6,7 +6,6 @@ import dataclasses
 import functools
 import hashlib
 import itertools
-import os
 import time
 import warnings
 from collections.abc import Callable, Iterable, Iterator, Mapping
@@ -23,7 +22,7 @@ from ..errors import RequestError
 from ..files import whole_file
 from ..materials import index_of, refractive_index
 from ..progress import Progress, silent, stage
-from ..settings import RigorousSettings
+from ..settings import RigorousSettings, usable_cores
 from ..surface.heightfield import HeightField
 from .coordinate_transformation import (
     ABOVE,
@@ -348,7 +347,7 @@ class _Build:
         work = self.work()
         total = sum(work)
         finished = sum(work[job] for job in done.done)
-        with ThreadPoolExecutor(os.cpu_count()) as pool:
+        with ThreadPoolExecutor(usable_cores()) as pool:
             try:
                 for job, solved in zip(remaining, pool.map(solve, remaining), strict=True):
                     done.add(job, solved)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
 from functools import cached_property, partial
@@ -13,6 +12,7 @@ import scipy.fft
 import scipy.linalg
 from numpy.typing import NDArray
 
+from ..settings import usable_cores
 from ..surface.heightfield import HeightField
 from .grids import SHIFTS, OrderGrid, SplineGrid, inner, spline
 from .tables import derivative_bound
@@ -58,7 +58,7 @@ class TilePowers:
     def __call__(self, kappa: float) -> NDArray[np.float64]:
         """Compute η_m(κ), (rows, columns); κ in rad/µm."""
         total = np.zeros(self._heights[0].shape)
-        with ThreadPoolExecutor(os.cpu_count()) as pool:
+        with ThreadPoolExecutor(usable_cores()) as pool:
             for power in pool.map(partial(self._power, kappa), self._heights):
                 total += power
         return self.grid.take(total / self.transforms)

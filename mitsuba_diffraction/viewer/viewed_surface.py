@@ -10,6 +10,7 @@ from pathlib import Path
 from typing import Any
 
 from ..errors import RequestError, is_number
+from ..files import examples_folder
 from ..grating_spectrum import GratingSpectrum
 from ..materials import refractive_index
 from ..precomputation import Spectrum, load_spectrum
@@ -176,7 +177,10 @@ class Surface:
             return cls(path.stem, load_spectrum(path), None, {"filename": path.name}, material)  # type: ignore[arg-type]
         if path.suffix.lower() == ".toml":
             recipe = Recipe.load(path)
-            return cls.of_recipe(recipe, path.stem, {"filename": path.name}, values, progress=progress)
+            # A recipe of the package has its name in a scene, wherever the scene lies.
+            of_package = path.resolve().parent == (examples_folder() / "precompute").resolve()
+            filename = path.stem if of_package else path.name
+            return cls.of_recipe(recipe, path.stem, {"filename": filename}, values, progress=progress)
         name = str(path)
         if name not in PROFILES:
             raise RequestError(

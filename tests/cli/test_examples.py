@@ -2,10 +2,14 @@
 
 import importlib
 import re
+import shutil
 from pathlib import Path
 
+import numpy as np
 import pytest
 from PIL import Image
+
+import mitsuba_diffraction.hologram as of_picture
 
 hologram = importlib.import_module("mitsuba_diffraction.cli.hologram")  # the package has the command by this name
 
@@ -73,4 +77,24 @@ def test_a_hologram_is_a_scene_with_its_textures(command, tmp_path, monkeypatch)
     assert command("hologram me.png -o other")[0] == 2
     assert Path("other/hologram.xml").read_text() == "<scene/>"
     code, _, error = command("hologram other/hologram.xml")
-    assert (code, error.count("\n"), "got no picture" in error) == (2, 1, True)
+    assert (code, error.count("\n"), "not a picture that can be read" in error) == (2, 1, True)
+    assert command("hologram me.png -o pre")[0] == 0
+    shutil.rmtree("pre/models")
+    Path("pre/hologram.xml").write_text("<scene/>")
+    assert command("hologram me.png -o pre")[0] == 2
+    assert not Path("pre/models").exists()
+
+
+def test_a_hologram_reads_pictures_as_design_does(tmp_path):
+    """Grey of 16 bits, and the orientation of a telephone's photograph; black pictures are refused."""
+    grey = np.full((36, 64), 32768, np.uint16)
+    Image.fromarray(grey).save(tmp_path / "grey.png")
+    assert of_picture.fitted(tmp_path / "grey.png", 64).mean() == pytest.approx(0.214, abs=0.01)
+    exif = Image.Exif()
+    exif[0x0112] = 6
+    Image.new("RGB", (90, 30), "white").save(tmp_path / "phone.jpg", exif=exif)
+    upright = of_picture.fitted(tmp_path / "phone.jpg", 64)[..., 0] > 0.5
+    assert upright.any(1).sum() > 2 * upright.any(0).sum()
+    Image.new("L", (64, 36)).save(tmp_path / "black.png")
+    with pytest.raises(ValueError, match="got a black picture"):
+        of_picture.fitted(tmp_path / "black.png", 64)

@@ -8,8 +8,8 @@ from PIL import Image
 
 import mitsuba_diffraction as md
 from mitsuba_diffraction import cli
-from mitsuba_diffraction.cli.design import read_target
 from mitsuba_diffraction.outputs import check_outputs
+from mitsuba_diffraction.picture_file import read_picture
 from mitsuba_diffraction.recipe import Recipe
 
 OPTIONS = "--texel 1 --texels 12 --wavelength 532 --starts 1"
@@ -33,7 +33,7 @@ def test_a_design_is_written_as_relief_recipe_and_picture(command):
     assert "532 nm" in said
     assert {path.name for path in Path().glob("plate.*")} == {"plate.gsf", "plate.tif", "plate.toml", "plate.png"}
     options = {"texel": 1.0, "texels": 12, "wavelengths": 532, "starts": 1, "seed": 3}
-    expected = md.design(read_target(Path("flag.png")), **options).height_field
+    expected = md.design(read_picture(Path("flag.png")), **options).height_field
     field = md.read_height_field("plate.gsf")
     assert field.pixel_size == pytest.approx(expected.pixel_size, rel=1e-6)
     assert field.heights == pytest.approx(expected.heights, abs=1e-6)
@@ -65,31 +65,31 @@ def test_texels_follow_from_the_detail(command):
 
 
 def test_a_target_is_a_picture_as_seen_on_a_screen():
-    found = read_target(Path("flag.png"))
+    found = read_picture(Path("flag.png"))
     assert found[5, 15] == 1
     assert found[15, 13] == pytest.approx(0.503, abs=1e-3)
     with Image.open("flag.png") as picture:
         picture.convert("RGBA").save("opaque.png")
-    assert np.array_equal(read_target(Path("opaque.png")), found)
+    assert np.array_equal(read_picture(Path("opaque.png")), found)
 
 
 def test_transparent_parts_are_dark_and_a_black_logo_is_inverted():
-    found = read_target(Path("flag.png"))
+    found = read_picture(Path("flag.png"))
     with Image.open("alpha.png") as picture:
         alpha = np.asarray(picture, float)[..., 3] / 255
-    assert read_target(Path("alpha.png")) == pytest.approx(found * alpha)
+    assert read_picture(Path("alpha.png")) == pytest.approx(found * alpha)
     logo = np.zeros((24, 24, 4), np.uint8)
     logo[5:9, 3:20, 3] = 255  # black ink on a transparent ground
     Image.fromarray(logo).save("logo.png")
-    assert read_target(Path("logo.png")).max() == 0
-    assert np.array_equal(read_target(Path("logo.png"), invert=True), logo[..., 3] > 0)
+    assert read_picture(Path("logo.png")).max() == 0
+    assert np.array_equal(read_picture(Path("logo.png"), invert=True), logo[..., 3] > 0)
 
 
 def test_a_negative_is_cast_and_dark_on_light_is_named(command):
     paper = 255 - np.asarray(Image.open("flag.png"))
     Image.fromarray(paper).save("paper.png")
-    negative = read_target(Path("paper.png"), invert=True)
-    assert negative == pytest.approx(read_target(Path("flag.png")), abs=1e-12)
+    negative = read_picture(Path("paper.png"), invert=True)
+    assert negative == pytest.approx(read_picture(Path("flag.png")), abs=1e-12)
     code, _, error = command(f"design paper.png {OPTIONS}")
     assert code == 0
     assert "note: paper.png is light up to its edges; --invert casts what is dark in it, with more contrast" in error
@@ -100,15 +100,15 @@ def test_a_target_is_upright_as_its_exif_data_say():
     exif[0x0112] = 6  # its first row is shown on the right
     with Image.open("flag.png") as picture:
         picture.save("phone.png", exif=exif)
-    upright = read_target(Path("flag.png"))
-    assert np.array_equal(read_target(Path("phone.png")), np.rot90(upright, -1))
+    upright = read_picture(Path("flag.png"))
+    assert np.array_equal(read_picture(Path("phone.png")), np.rot90(upright, -1))
     assert not np.array_equal(np.rot90(upright, -1), upright)
 
 
 def test_a_target_may_be_a_pgm_of_16_bits():
     levels = np.linspace(0, 65535, 8).astype(">u2").reshape(1, 8).repeat(8, 0)
     Path("grey.pgm").write_bytes(b"P5 8 8 65535\n" + levels.tobytes())
-    assert read_target(Path("grey.pgm"))[0, [0, 7]] == pytest.approx([0, 1])
+    assert read_picture(Path("grey.pgm"))[0, [0, 7]] == pytest.approx([0, 1])
 
 
 @pytest.mark.parametrize("kind", [np.float32, np.int32])
@@ -116,7 +116,7 @@ def test_a_target_of_32_bits_is_refused(kind):
     levels = np.linspace(0, 1, 8).reshape(1, 8).repeat(8, 0)
     Image.fromarray((levels * (1 if kind == np.float32 else 255)).astype(kind)).save("grey.tif")
     with pytest.raises(ValueError, match=r"grey\.tif: got numbers of 32 bits, wanted a picture of 8 or 16 bits"):
-        read_target(Path("grey.tif"))
+        read_picture(Path("grey.tif"))
 
 
 def test_an_interrupted_command_writes_the_best_so_far(command, monkeypatch):

@@ -53,6 +53,10 @@ def test_a_page_of_a_film_says_that_it_shows_reflected_light(command, tmp_path, 
     assert "film: the page shows the light that it reflects" in error
 
 
+def test_a_recipe_of_the_package_has_its_name_in_the_saved_scene():
+    assert Surface.named("elaphe_afm", {}).grating == {"filename": "elaphe_afm"}
+
+
 @pytest.mark.slow
 def test_all_kinds_of_surfaces_are_shown(command, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)

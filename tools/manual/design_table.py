@@ -19,10 +19,10 @@ import scipy.optimize
 from numpy.typing import NDArray
 
 import mitsuba_diffraction as md
-from mitsuba_diffraction.cli.design import read_target
 from mitsuba_diffraction.inverse_design.plate import Plate
 from mitsuba_diffraction.inverse_design.search import far_field_of
 from mitsuba_diffraction.inverse_design.target import wanted_fractions
+from mitsuba_diffraction.picture_file import read_picture
 
 CAT = Path(__file__).parents[2] / "precompute" / "designed" / "cat.png"
 PLATES: dict[str, Mapping[str, float]] = {
@@ -102,7 +102,7 @@ def main(words: Sequence[str]) -> None:
         for name, target in targets().items():
             print(bound(name, target), flush=True)
         return
-    cat = read_target(CAT)
+    cat = read_picture(CAT)
     requests = [(f"cat, {name}", cat, options) for name, options in PLATES.items()]
     requests += [(name, target, {}) for name, target in targets().items()]
     requests += [(f"{name}, laser of 670 nm", targets()[name], {"wavelengths": 670}) for name in ("four bars", "ring")]
