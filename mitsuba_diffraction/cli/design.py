@@ -17,11 +17,12 @@ from ..inverse_design.plate import for_detail
 from ..inverse_design.search import WHITE
 from ..outputs import check_outputs, free_name
 from ..picture_file import read_picture
-from ..progress import progress_bar, say, show, table, tell
+from ..progress import bytes_text, progress_bar, say, show, table, tell
 from .arguments import Overwrite, check_suffix, converted, parse_numbers
 from .render import Stopped
 
 _MIN_SAID_TIME = 90.0  # s, that a search takes
+_MIN_SAID_MEMORY = 1e9  # bytes
 
 
 def design(
@@ -103,7 +104,7 @@ def design(
             starts=starts,
             seed=seed,
             progress=progress,
-            expect=_say_time,
+            expect=_say_effort,
         )
     paths = save(found, path)
     makers.export(found, exports)
@@ -126,9 +127,11 @@ def design(
         raise Stopped(f"{relief} holds the best relief so far")
 
 
-def _say_time(seconds: float) -> None:
-    if seconds > _MIN_SAID_TIME:
-        say("note", f"about {seconds / 60:.0f} min; Ctrl-C ends the search and keeps the best relief so far")
+def _say_effort(seconds: float, memory: float) -> None:
+    if seconds > _MIN_SAID_TIME or memory > _MIN_SAID_MEMORY:
+        minutes = f"{seconds / 60:.0f} min" if seconds > _MIN_SAID_TIME else f"{seconds:.0f} s"
+        effort = f"about {minutes} and {bytes_text(memory)} of memory"
+        say("note", f"{effort}; Ctrl-C ends the search and keeps the best relief so far")
 
 
 def _is_dark_on_light(picture: NDArray[np.float64]) -> bool:

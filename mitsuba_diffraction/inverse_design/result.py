@@ -18,6 +18,7 @@ from .far_field import Array, lobes_in_bins
 from .plate import Plate
 
 _PIXEL = 1 / 4  # of the shortest wavelength, at most: resolves all frequencies that light reaches
+_BYTES_PER_PIXEL = 620  # of the relief: as measured, of plates of 64 and of 256 texels
 _BRIGHT = 0.1  # of the maximum of a target: what is brighter is in the target
 _LOBE = 3.0  # standard deviations, of order 0
 # Of its making: factors of the heights and of the tool's blur.
@@ -145,11 +146,21 @@ class Design:
         return _efficiency(predicted, self.wanted[nearest])
 
 
-def _relief(heights: Array, plate: Plate, blur_scale: float = 1.0) -> HeightField:
-    """Return one period of the relief, in pixels of at most `_PIXEL`; inside a sheet wavelengths are shorter."""
+def _pixels_per_texel(plate: Plate) -> int:
+    """Return the number of pixels of at most `_PIXEL` along a texel; inside a sheet wavelengths are shorter."""
     index = 1.0 if plate.int_ior is None else float(plate.index(plate.wavelengths * 1e-3).max())
     pixel = _PIXEL * plate.light[0] * 1e-3 / index
-    per_texel = max(4, math.ceil(plate.texel / pixel))
+    return max(4, math.ceil(plate.texel / pixel))
+
+
+def memory_of_prediction(plate: Plate) -> float:
+    """Return the bytes that `Design.of` takes, about; the search takes less."""
+    return _BYTES_PER_PIXEL * float(plate.texels * _pixels_per_texel(plate)) ** 2
+
+
+def _relief(heights: Array, plate: Plate, blur_scale: float = 1.0) -> HeightField:
+    """Return one period of the relief."""
+    per_texel = _pixels_per_texel(plate)
     spread = plate.spread(per_texel, blur_scale)
     source = f"design of {plate.texels} × {plate.texels} texels of {plate.texel:g} µm"
     return HeightField(spread @ heights @ spread.T, plate.texel / per_texel, source)
@@ -175,8 +186,13 @@ def _far_field(relief: HeightField, plate: Plate, wavelengths: Array, bins: int)
             )
             m, power = orders.m, orders.unpolarised
         power = power / power.sum()
-        along_x, along_y = (lobes_in_bins(edges, one, plate.period, wavelength, plate.coherence_length) for one in m.T)
-        predicted.append((along_y * power) @ along_x.T)
+        # P = A η Aᵀ, as in `far_field`; the memory for a lobe of each order would be many gigabytes.
+        reach = int(np.abs(m).max())
+        of_orders = np.zeros((2 * reach + 1, 2 * reach + 1))
+        of_orders[m[:, 1] + reach, m[:, 0] + reach] = power
+        axis = np.arange(-reach, reach + 1)
+        lobes = lobes_in_bins(edges, axis, plate.period, wavelength, plate.coherence_length)
+        predicted.append(lobes @ of_orders @ lobes.T)
         mirror.append(power[(m == 0).all(axis=-1)].sum())
     return np.array(predicted), np.array(mirror)
 

@@ -18,7 +18,7 @@ from ..rigorous.solver import one_thread
 from ..settings import MIN_WAVELENGTH
 from .far_field import Array, FarField, lobes_in_bins, nearest_levels
 from .plate import Plate
-from .result import Design
+from .result import Design, memory_of_prediction
 from .target import wanted_fractions, with_unused
 
 WHITE = 1e3 / np.linspace(1e3 / 430, 1e3 / 670, 8)  # nm, equidistant in 1/λ
@@ -47,7 +47,7 @@ def design(
     starts: int = 24,
     seed: int = 0,
     progress: Progress = silent,
-    expect: Callable[[float], None] = lambda seconds: None,
+    expect: Callable[[float, float], None] = lambda seconds, memory: None,
 ) -> Design:
     """Compute a relief that casts a picture, for light along its normal.
 
@@ -75,7 +75,8 @@ def design(
         starts: random reliefs from which the search begins; the best of them is continued.
         seed: of the random reliefs.
         progress: called with (iterations done, iterations in all).
-        expect: called once, before the search, with the seconds that it will take on this machine, about.
+        expect: called once, before the search, with the seconds that it will take on this machine, and the bytes of
+            memory, about.
 
     Returns:
         The relief and its predicted far field. After a KeyboardInterrupt it is the best so far (`Design.interrupted`).
@@ -150,7 +151,7 @@ class _Search:
     """The search for the heights of the texels; an exception, such as KeyboardInterrupt, loses nothing."""
 
     def __init__(
-        self, plate: Plate, wanted: Array, starts: int, progress: Progress, expect: Callable[[float], None]
+        self, plate: Plate, wanted: Array, starts: int, progress: Progress, expect: Callable[[float, float], None]
     ) -> None:
         self._expect = expect
         self._plate, self._wanted, self._starts = plate, wanted, starts
@@ -171,7 +172,8 @@ class _Search:
             for scale, per_texel in ((0.5, _COARSE), (1.0, _COARSE), (1.0, _FINE))
         )
         coarse, exact = (_seconds(far_field, self.heights) for far_field in (own, fine))
-        self._expect(_LOSSES_PER_ITERATION * (self._starts * 2 * _FIRST_ITERATIONS * coarse + _LAST_ITERATIONS * exact))
+        losses = self._starts * 2 * _FIRST_ITERATIONS * coarse + _LAST_ITERATIONS * exact
+        self._expect(_LOSSES_PER_ITERATION * losses, memory_of_prediction(self._plate))
         random = np.random.default_rng(seed)
         for _ in range(self._starts):
             heights = self._minimised(wide, self._random_relief(random), _FIRST_ITERATIONS)

@@ -1,5 +1,6 @@
 """Designs: what the BSDF and the precomputed spectrum say of them, and requests that are refused."""
 
+import tracemalloc
 from pathlib import Path
 
 import colour
@@ -154,7 +155,7 @@ def test_a_search_among_levels_beats_rounding(laser):
     assert stepped.efficiency[0] > 1.1 * rounded.efficiency[0]
 
 
-def test_the_time_of_a_search_is_told_before_it(monkeypatch):
+def test_the_time_and_the_memory_of_a_design_are_told_before_it(monkeypatch):
     told = []
     monkeypatch.setattr("mitsuba_diffraction.inverse_design.search._seconds", lambda *_: 0.01)
 
@@ -162,8 +163,17 @@ def test_the_time_of_a_search_is_told_before_it(monkeypatch):
         assert len(told) == 1
         raise KeyboardInterrupt
 
-    md.design(lopsided(), wavelengths=532, texel=1.0, texels=16, starts=4, progress=stop, expect=told.append)
-    assert told == pytest.approx([0.011 * (4 * 150 + 400)])
+    def expect(seconds, memory):
+        told.append((seconds, memory))
+
+    tracemalloc.start()
+    found = md.design(lopsided(), wavelengths=532, texel=1.0, texels=48, starts=4, progress=stop, expect=expect)
+    peak = tracemalloc.get_traced_memory()[1]
+    tracemalloc.stop()
+    ((seconds, memory),) = told
+    assert seconds == pytest.approx(0.011 * (4 * 150 + 400))
+    assert memory == 620 * found.height_field.heights.size
+    assert 0.3 * memory < peak < 1.5 * memory
 
 
 def test_an_interrupted_design_is_the_best_so_far(laser):
