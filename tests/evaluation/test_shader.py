@@ -10,13 +10,13 @@ import pytest
 from scipy.special import diric
 
 import mitsuba_diffraction as md
+from mitsuba_diffraction.errors import root_cause
 from mitsuba_diffraction.evaluation.realtime_shader import tristimulus
 from mitsuba_diffraction.evaluation.realtime_shader.evaluate import VARIANTS, colour, relative_radiance, shader_for
 from mitsuba_diffraction.evaluation.realtime_shader.nmm_pq import line_area
 from mitsuba_diffraction.evaluation.realtime_shader.pq import tile_factor, tiling_power
 from mitsuba_diffraction.evaluation.realtime_shader.quirks import Quirks
 from mitsuba_diffraction.evaluation.realtime_shader.taylor_textures import series_error, taylor_transforms
-from mitsuba_diffraction.render.scene import root_cause
 from mitsuba_diffraction.testing import array, vectors
 
 PUBLISHED, CORRECTED = Quirks.as_published(), Quirks.corrected()

@@ -234,7 +234,7 @@ def test_the_scene_of_a_view_has_file_names_without_folders(opened):
     with tab.expect_download() as saved:
         tab.locator("#copy").click()
     scene = saved.value.path().read_text()
-    assert 'name="filename" value="blaze.toml"' in scene
+    assert 'name="filename" value="blaze"' in scene
     assert scene == tab.evaluate("viewer.scene()")
     assert tab.evaluate("viewer.command()") == "mitsuba-diffraction render view.xml --spp 64\n"
     assert str(RECIPES.parent) not in tab.content()
