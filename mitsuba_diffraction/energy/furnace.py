@@ -257,17 +257,17 @@ class Furnace:
         index = (branch and self.index) or 1.0
         sigma = np.multiply.outer(length / index, self.widths.astype(length.dtype)[bins])
         tangent = np.multiply.outer(length**2, (self.q**2).sum(-1).astype(length.dtype)[bins])
-        reach = float(np.sqrt(3)) * sigma
-        far = (rho + reach) ** 2 <= 1 - np.maximum(sigma, MIN_COS_ONE_POINT) ** 2
-        i, j = np.nonzero(~far & (rho - reach < 1))
+        radius = float(np.sqrt(3)) * sigma
+        far = (rho + radius) ** 2 <= 1 - np.maximum(sigma, MIN_COS_ONE_POINT) ** 2
+        i, j = np.nonzero(~far & (rho - radius < 1))
         cos_o, r, _ = _above_horizon(rho, sigma, 1)
         all_i = np.arange(len(cos_i))[:, None]
         value, cosine = self._at_points(cos_i[:, None], length[:, None], bins, rho, sigma, tangent, cos_o, r, branch)
-        parts = [(all_i, bins, value * far, cosine)]
+        of_far = all_i, bins, value * far, cosine
         rho, sigma, tangent = (x[i, j] for x in (rho, sigma, tangent))
         cos_o, r, weight = _above_horizon(rho, sigma, 3)
         value, cosine = self._at_points(cos_i[i], length[i], bins[j], rho, sigma, tangent, cos_o, r, branch)
-        return [*parts, (np.tile(i, 3), np.tile(bins[j], 3), (value * weight).ravel(), cosine.ravel())]
+        return [of_far, (np.tile(i, 3), np.tile(bins[j], 3), (value * weight).ravel(), cosine.ravel())]
 
     def _at_points(
         self,
@@ -422,8 +422,8 @@ def _above_horizon(rho: Real, sigma: Real, count: int) -> tuple[Real, Real, Real
     r² + σ² + cos² θ_o = 1, where σ² is the variance across the radius; weights sum to the fraction of ρ ± √3 σ above
     the horizon. A single point, without a first axis, is for bins that are far above it and has the weight one.
     """
-    reach, square = float(np.sqrt(3)) * sigma, 1 - sigma**2
-    low, high = np.maximum(rho - reach, 0), rho + reach
+    radius, square = float(np.sqrt(3)) * sigma, 1 - sigma**2
+    low, high = np.maximum(rho - radius, 0), rho + radius
     nearest, farthest = (np.sqrt(np.maximum(square - x**2, 0)) for x in (low, high))
     if count == 1:
         cos_o = np.maximum((nearest + farthest) / 2, 1e-6)

@@ -187,10 +187,10 @@ def _far_field(relief: HeightField, plate: Plate, wavelengths: Array, bins: int)
             m, power = orders.m, orders.unpolarised
         power = power / power.sum()
         # P = A η Aᵀ, as in `far_field`; the memory for a lobe of each order would be many gigabytes.
-        reach = int(np.abs(m).max())
-        of_orders = np.zeros((2 * reach + 1, 2 * reach + 1))
-        of_orders[m[:, 1] + reach, m[:, 0] + reach] = power
-        axis = np.arange(-reach, reach + 1)
+        max_order = int(np.abs(m).max())
+        of_orders = np.zeros((2 * max_order + 1, 2 * max_order + 1))
+        of_orders[m[:, 1] + max_order, m[:, 0] + max_order] = power
+        axis = np.arange(-max_order, max_order + 1)
         lobes = lobes_in_bins(edges, axis, plate.period, wavelength, plate.coherence_length)
         predicted.append(lobes @ of_orders @ lobes.T)
         mirror.append(power[(m == 0).all(axis=-1)].sum())

@@ -328,7 +328,7 @@ class RigorousSpectrum:
 
     @property
     def details(self) -> str:
-        """The largest errors."""
+        """The maximum errors."""
         return (
             f"maximum error {self.max_error:.1e} of the reflected light, {self.max_error_near:.1e} near a Rayleigh "
             "anomaly" + ("" if self.mueller is None else f"; Mueller matrices, mean {self.polarisation_error:.1e}")

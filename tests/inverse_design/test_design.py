@@ -176,6 +176,20 @@ def test_the_time_and_the_memory_of_a_design_are_told_before_it(monkeypatch):
     assert 0.3 * memory < peak < 1.5 * memory
 
 
+def test_a_prediction_has_no_lobe_of_every_order_in_memory():
+    """16,000 orders over 801 bins would take 0.3 GB."""
+    plate = Plate(
+        **{"texel": 0.8, "texels": 48, "height_range": 0.8, "angle": 17.5, "wavelengths": np.array([532.0])},
+        **{"int_ior": None, "levels": None, "tool_blur": 0.13, "seen_on": "wall", "unused": "outside"},
+    )
+    heights = np.random.default_rng(0).random((48, 48))
+    tracemalloc.start()
+    Design.of(heights, plate, np.full((1, 801, 801), 801**-2))
+    peak = tracemalloc.get_traced_memory()[1]
+    tracemalloc.stop()
+    assert peak < 0.2e9
+
+
 def test_an_interrupted_design_is_the_best_so_far(laser):
     def stop(done, total):
         assert total == 1300
