@@ -64,4 +64,4 @@ class SplineSpectrum:
 
     def sample(self, incidence: Incidence, u: mi.Float, v: mi.Point2f, active: mi.Bool) -> tuple[mi.Point2f, mi.Bool]:
         """As `Scattering.sample`; as no order is chosen, none is evanescent."""
-        return self.sampler.sample(incidence, u, v, active), active
+        return self.sampler.sample(incidence, u, v, active)

@@ -28,6 +28,7 @@ BLOCK = 4  # columns of bins; tables of the sums of all columns would be slow to
 MAX_LINE_WIDTH = 0.25  # standard deviation of q across lines and ridges, relative to that along the axis
 MAX_RATIO = 1e6  # (n_o/λ)²/|q − c|², above which the inversion of q lies outside of all tables
 LOBE_CUTOFF = 4.0  # of the lobes of orders, in σ_q
+MIN_MASS = 1e-5  # of the rows that meet the disc; the rounding error of the sums of rows is 1e-7
 
 
 @dataclass(frozen=True, eq=False)
@@ -71,7 +72,8 @@ class BinSampler:
 
     with A_jnm the mean power, in a bin of κ (`KappaBins`), of the bin in row n and column m, |q_x − mΔ_x| ≤ Δ_x/2 and
     |q_y − nΔ_y| ≤ Δ_y/2. M_j is their sum. Of lines and ridges, whose q is spread along one axis, much light may be
-    evanescent: only the rows that meet the disc are drawn and summed. Rows lie across this axis.
+    evanescent: only the rows that meet the disc are drawn and summed. Rows lie across this axis. Where they have nearly
+    no power, no q is drawn, and the density is zero.
 
     A bin is drawn by two binary searches, for its row and for its block of columns; the density at a given q reads two
     words, of lines and ridges two packets more.
@@ -114,7 +116,7 @@ class BinSampler:
         inverse, ratio = _inverted(q, centre, incidence.radius)
         of_inverse = self._powers(inverse, rows, active & (ratio < MAX_RATIO))
         powers = dr.fma(dr.square(ratio), of_inverse, self._powers(q, rows, active))
-        weights = self.kappa_bins.weights(incidence) * dr.select(mass > 1e-20, dr.rcp(mass), 0)
+        weights = self.kappa_bins.weights(incidence) * dr.select(mass > MIN_MASS, dr.rcp(mass), 0)
         return dr.dot(weights, powers) * self.per_q[0] * self.per_q[1]
 
     def _powers(self, q: mi.Vector2f, rows: tuple[mi.Int32, mi.Int32], active: mi.Bool) -> mi.Vector4f:
@@ -126,8 +128,8 @@ class BinSampler:
         active = active & (row >= rows[0]) & (row < rows[1]) & (column >= 0) & (column < BLOCK * self.blocks)
         return self.powers(mi.UInt32(row * (BLOCK * self.blocks) + column), active)
 
-    def sample(self, incidence: Incidence, u: mi.Float, v: mi.Point2f, active: mi.Bool) -> mi.Point2f:
-        """Draw q in cycles/µm, for one wavelength.
+    def sample(self, incidence: Incidence, u: mi.Float, v: mi.Point2f, active: mi.Bool) -> tuple[mi.Point2f, mi.Bool]:
+        """Draw q in cycles/µm, for one wavelength, and return where one was drawn.
 
         `u` chooses the κ bin and the row, `v.x` the block, the column and the position in the column, `v.y` the
         position in the row.
@@ -139,6 +141,9 @@ class BinSampler:
             return table.component(mi.UInt32(index), kappa_bin, active)
 
         rows, blocks = self._rows(centre, incidence), (mi.Int32(0), mi.Int32(self.blocks))
+        if self.is_line:
+            first, end = (cumulative(self.cumulative_rows, row) for row in rows)
+            active = active & (end - first > MIN_MASS)
         row, _ = search(lambda i: cumulative(self.cumulative_rows, i), *rows, self.rows, u)
         start = row * (self.blocks + 1)
         block, x = search(lambda i: cumulative(self.cumulative_blocks, start + i), *blocks, self.blocks, v.x)
@@ -146,7 +151,7 @@ class BinSampler:
         bins = mi.Point2f(BLOCK * block + mi.Int32(column) - self.max_index[0], row - self.max_index[1])
         q = mi.Point2f((bins.x + x - 0.5) * self.spacing[0], (bins.y + v.y - 0.5) * self.spacing[1])
         inverse, ratio = _inverted(q, centre, incidence.radius)
-        return self._axes(dr.select(ratio < 1, inverse, q))
+        return self._axes(dr.select(ratio < 1, inverse, q)), active
 
     def _axes(self, q: mi.Vector2f) -> mi.Vector2f:
         """Return components along columns and along rows from those along x and y, or vice versa."""

@@ -259,15 +259,18 @@ class Geometry:
         squares, gain = self.order_squares_and_gain(self.kappa_sign * tangent, per_width)
         return self.k_g(*squares, dr.squared_norm(tangent), incidence) * gain * self.factor
 
-    def order_kappa(self, tangent: mi.Vector2f, incidence: Incidence) -> mi.Float:
-        """Return |κ| in rad/µm: of the two directions for reflected light, of the order for transmitted light.
+    def order_kappa(self, tangent: mi.Vector2f, incidence: Incidence) -> tuple[mi.Float, mi.Bool]:
+        """Return |κ| in rad/µm and where κ has another sign than κ of the two directions.
 
-        In transmission K grows as 1/v_z² and the power falls as κ². Both use the v_z of the order, so that these
+        κ is that of the two directions for reflected light, and that of the order for transmitted light: in
+        transmission K grows as 1/v_z² and the power falls as κ², and both use the v_z of the order, so that these
         factors cancel.
         """
         (square_i, square_o), _ = self.order_squares_and_gain(self.kappa_sign * tangent, mi.Float(0))
-        v_z = dr.select(self.reflects, self.v_z, self.incident.normal(square_i) - self.outgoing.normal(square_o))
-        return dr.abs(v_z) * dr.two_pi * incidence.frequency * self.height_scale
+        of_order = self.incident.sign * (self.incident.normal(square_i) - self.outgoing.normal(square_o))
+        v_z = dr.select(self.reflects, self.v_z, of_order)
+        has_other_sign = ~self.reflects & (of_order * self.kappa_sign < 0)
+        return dr.abs(v_z) * dr.two_pi * incidence.frequency * self.height_scale, has_other_sign
 
     def continuum_factor(self, incidence: Incidence, per_width: mi.Float) -> mi.Float:
         """Return n_o² ((1 − b) K G + b Γ) |cos θ_o| of a continuum, for which no order is known.

@@ -325,13 +325,14 @@ class OrderSpectrum:
         m_x, m_y = (axis.first(q) for axis, q in zip(self.axes, q, strict=True))
         lobes_x, lobes_y = self.axes[0].lobes(m_x, q.x, scale), self.axes[1].lobes(m_y, q.y, scale)
         q_sign, factor = incidence.q_sign, 1
-        # Each window of orders is read at one κ: offsets of its column and row, lobes along x and y, κ.
+        # Each window of orders is read at one κ: offsets of its column and row, lobes along x and y, κ, and whether
+        # it is read at −m.
         if isinstance(self.sampler, OrderSampler):
             tangent = self._tangent(m_x, m_y, incidence.wavelength)
             factor = geometry.order_factor(tangent, incidence, per_width)
-            windows = [(0, 0, lobes_x, lobes_y, geometry.order_kappa(tangent, incidence))]
-            m = (mi.Int32(q_sign) * m_x, mi.Int32(q_sign) * m_y)
-            probability = self.sampler.probability(*m, incidence, active)
+            windows = [(0, 0, lobes_x, lobes_y, *geometry.order_kappa(tangent, incidence))]
+            sign = mi.Int32(q_sign)
+            probability = self.sampler.probability(sign * m_x, sign * m_y, incidence, active)
             # Evanescent orders are not drawn.
             propagates = incidence.propagates(q_sign * tangent)
             density = dr.select(propagates, probability * lobes_x[0] * lobes_y[0], 0)
@@ -342,15 +343,18 @@ class OrderSpectrum:
                 for x, y in np.ndindex(len(lobes_x), len(lobes_y)):
                     tangent = self._tangent(m_x + x, m_y + y, incidence.wavelength)
                     lobe = geometry.order_factor(tangent, incidence, per_width) * lobes_x[x]
-                    windows.append((x, y, [lobe], [lobes_y[y]], geometry.order_kappa(tangent, incidence)))
+                    windows.append((x, y, [lobe], [lobes_y[y]], *geometry.order_kappa(tangent, incidence)))
             else:
                 factor = geometry.continuum_factor(incidence, per_width)
-                windows = [(0, 0, lobes_x, lobes_y, geometry.kappa(incidence.frequency))]
-        row, column = (m + (axis.max_order + axis.rim) for m, axis in zip((m_y, m_x), self.axes[::-1], strict=True))
+                windows = [(0, 0, lobes_x, lobes_y, geometry.kappa(incidence.frequency), mi.Bool(False))]
         power = 0
-        for x, y, of_x, of_y, kappa in windows:
+        for x, y, of_x, of_y, kappa, negated in windows:
             at = self.power.at(kappa, geometry.small())
-            power += factor * self.power.window(row + y, column + x, of_x, of_y, at, active)
+            column, row = (
+                axis.max_order + axis.rim + dr.select(negated, -m, m)
+                for axis, m in zip(self.axes, (m_x + x, m_y + y), strict=True)
+            )
+            power += factor * self.power.window(row, column, of_x, of_y, at, active)
         # Interpolated powers may be slightly negative.
         return dr.select(active, larger(power, 0), 0), density
 
@@ -362,7 +366,7 @@ class OrderSpectrum:
     def sample(self, incidence: Incidence, u: mi.Float, v: mi.Point2f, active: mi.Bool) -> tuple[mi.Point2f, mi.Bool]:
         """As `Scattering.sample`."""
         if isinstance(self.sampler, BinSampler):
-            return self.sampler.sample(incidence, u, v, active), active
+            return self.sampler.sample(incidence, u, v, active)
         m_x, m_y = self.sampler.sample(incidence, u, active)
         tangent = self._tangent(m_x, m_y, incidence.wavelength)
         scale = incidence.lobe_scale

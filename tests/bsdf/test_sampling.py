@@ -269,7 +269,7 @@ def test_continua_are_drawn_with_their_density_and_propagate(llvm, name, theta, 
     sampler = BinSampler(blurred(name))
     s = direction(theta, phi)
     incidence = incidence_of(s, wavelength)
-    q = sampler.sample(incidence, *points(numbers(count)), True)
+    q, _ = sampler.sample(incidence, *points(numbers(count)), True)
     dr.eval(q)
     tangent = np.array([wavelength * np.array(x, np.float64) for x in q]) + s[:2, None]
     distance = np.hypot(*tangent)
