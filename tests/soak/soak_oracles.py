@@ -445,7 +445,8 @@ def bound(case: Case, total):
     c = case.c
     for (wi, _), of_direction in zip(case.directions, total, strict=True):
         limit = 1.02 if wi[2] > 0 or c.transmission == "sheet" else 1.10
-        limit += 0.03 * (c.theory == "rigorous")  # whose tables have a mean error of 0.02
+        if c.theory == "rigorous":  # whose tables have a mean error of 0.02, and a larger one at the horizon
+            limit += 3 * 0.02
         case.require((of_direction < limit + 0.015).all(), "(e) R + T ≤ bound", wi=wi, got=of_direction, limit=limit)
 
 
@@ -485,8 +486,9 @@ def is_reciprocal(case: Case):
         case.require(
             not bad.any(), "(d) reciprocity", wi=wi[j], wo=wo[j], there=there[j], back=back[j], count=bad.sum()
         )
-        # Polarised variants multiply the faces in another order, with other rounding errors.
-        bad = np.abs(there - radiance) > 0.1 * relative[:, None] * scale + 1e-6 * scale.max(initial=0) + 1e-7
+        # Polarised variants multiply the faces in another order, with other rounding errors, also of 1 − 1.
+        floor = 1e-6 * scale.max(initial=0) + (3e-6 if case.c.polarised else 1e-7)
+        bad = np.abs(there - radiance) > 0.1 * relative[:, None] * scale + floor
         j = np.argmax(bad.any(-1))
         case.require(not bad.any(), "(d) radiance scales with n²", wi=wi[j], wo=wo[j], there=there[j], got=radiance[j])
 
