@@ -11,33 +11,36 @@ import importlib
 import importlib.metadata
 from typing import TYPE_CHECKING
 
-from .registration import register as _register
+from .registration.import_hook import register as _register
 
 if TYPE_CHECKING:  # type checkers do not see what is imported on first use
-    from . import reference, rigorous
-    from .efficiency import efficiencies
-    from .grating_spectrum import GratingSpectrum
+    from . import rigorous
+    from .bsdf import testing
+    from .inspection.efficiency import efficiencies
+    from .inspection.peaks import peak_efficiencies
     from .inverse_design import design
-    from .peaks import peak_efficiencies
-    from .precomputation import precompute
-    from .recipe import Recipe
+    from .precomputation.grating_spectrum import GratingSpectrum
+    from .precomputation.recipe import Recipe
+    from .precomputation.spectra import precompute
+    from .scalar_theory import reference
     from .surface import gratings
     from .surface.heightfield import HeightField
     from .surface.readers import read_height_field
     from .viewer import view
 
 _HOME = {
-    "GratingSpectrum": "grating_spectrum",
+    "GratingSpectrum": "precomputation.grating_spectrum",
     "HeightField": "surface.heightfield",
-    "Recipe": "recipe",
+    "Recipe": "precomputation.recipe",
     "design": "inverse_design",
-    "efficiencies": "efficiency",
+    "efficiencies": "inspection.efficiency",
     "gratings": "surface.gratings",
-    "peak_efficiencies": "peaks",
-    "precompute": "precomputation",
+    "peak_efficiencies": "inspection.peaks",
+    "precompute": "precomputation.spectra",
     "read_height_field": "surface.readers",
-    "reference": "reference",
+    "reference": "scalar_theory.reference",
     "rigorous": "rigorous",
+    "testing": "bsdf.testing",
     "view": "viewer",
 }
 
@@ -53,6 +56,7 @@ __all__ = [
     "read_height_field",
     "reference",
     "rigorous",
+    "testing",
     "view",
 ]
 

@@ -36,8 +36,8 @@ from PIL import Image
 from scipy import stats
 
 from mitsuba_diffraction.cli import app
-from mitsuba_diffraction.color import into_gamut, spectrum_to_linear_sRGB
-from mitsuba_diffraction.files import whole_file
+from mitsuba_diffraction.files.writing import whole_file
+from mitsuba_diffraction.optics.color import into_gamut, spectrum_to_linear_sRGB
 from mitsuba_diffraction.render import SpectralImage
 
 ROOT = Path(__file__).parents[1]

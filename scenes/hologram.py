@@ -6,7 +6,7 @@ from pathlib import Path
 
 from modelling import command
 
-from mitsuba_diffraction import hologram
+from mitsuba_diffraction.inverse_design import hologram
 
 _ROOT = Path(__file__).parents[1]
 # A preview (.png), or what gallery.py makes of it; the package itself has no gallery.

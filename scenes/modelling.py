@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 from PIL import Image
 
-from mitsuba_diffraction.files import whole_file
+from mitsuba_diffraction.files.writing import whole_file
 
 import mitsuba as mi  # isort: skip  (after LLVM has been chosen)
 

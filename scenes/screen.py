@@ -22,8 +22,8 @@ from numpy.typing import NDArray
 from PIL import Image, ImageDraw, ImageFont
 from scipy import ndimage
 
-from mitsuba_diffraction.color import into_gamut, spectrum_to_linear_sRGB
-from mitsuba_diffraction.files import whole_file
+from mitsuba_diffraction.files.writing import whole_file
+from mitsuba_diffraction.optics.color import into_gamut, spectrum_to_linear_sRGB
 from mitsuba_diffraction.render import SpectralImage
 
 PHOTOGRAPH = Path(__file__).parents[1] / "precompute" / "measured" / "published" / "elaphe_photograph.jpg"

@@ -15,7 +15,7 @@ import pytest
 from bsdf_support import WAVELENGTHS, made_up, of_spectrum, random_directions, spectrum, uniform
 
 import mitsuba_diffraction as md
-from mitsuba_diffraction.testing import array, direction, floats, interaction, vectors
+from mitsuba_diffraction.bsdf.testing import array, direction, floats, interaction, vectors
 
 pytestmark = pytest.mark.usefixtures("llvm")
 WI = direction(25.0, 40.0)

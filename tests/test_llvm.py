@@ -21,10 +21,10 @@ WHEEL = next((file for file in WHEEL_FILES if file.name.startswith("libLLVM") an
 
 needs_wheel = pytest.mark.skipif(WHEEL is None, reason="karellen-llvm-core is not installed")
 
-IMPORT = "import mitsuba_diffraction; from mitsuba_diffraction import llvm; import drjit as dr, mitsuba as mi"
+IMPORT = "import mitsuba_diffraction; from mitsuba_diffraction import variants; import drjit as dr, mitsuba as mi"
 USE = """
-assert llvm.problem() is None, llvm.problem()
-assert dr.detail.llvm_version() >= llvm.MINIMUM_VERSION, dr.detail.llvm_version()
+assert variants.llvm_problem() is None, variants.llvm_problem()
+assert dr.detail.llvm_version() >= variants.MINIMUM_VERSION, dr.detail.llvm_version()
 mi.set_variant("llvm_ad_spectral")
 assert dr.allclose(dr.maximum(mi.Float(1, 2), dr.opaque(mi.Float, 1.5)), [1.5, 2])
 """
@@ -125,9 +125,9 @@ def test_without_any_llvm_the_message_says_what_is_missing(first: str) -> None:
         "from importlib import metadata; metadata.distributions = lambda **arguments: []",
         first,
         IMPORT,
-        "print(llvm.problem())",
+        "print(variants.llvm_problem())",
         "mi.set_variant('scalar_spectral'); mi.load_dict({'type': 'diffuse'})",
-        "from mitsuba_diffraction.llvm import choose_variant",
+        "from mitsuba_diffraction.variants import choose_variant",
         "try: choose_variant('llvm_ad_spectral')",
         "except RuntimeError as error: print(error)",
         library="/nonexistent",

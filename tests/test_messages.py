@@ -8,7 +8,7 @@ import mitsuba as mi
 import pytest
 
 import mitsuba_diffraction
-from mitsuba_diffraction.recipe import Recipe
+from mitsuba_diffraction.precomputation.recipe import Recipe
 from mitsuba_diffraction.render.scene import load_spectral_scene
 
 SCENES = Path(__file__).parents[1] / "scenes"

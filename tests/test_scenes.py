@@ -16,8 +16,8 @@ from PIL import Image
 from scipy.special import j1
 
 import mitsuba_diffraction as md
-from mitsuba_diffraction import hologram as gratings_of
-from mitsuba_diffraction.recipe import Recipe
+from mitsuba_diffraction.inverse_design import hologram as gratings_of
+from mitsuba_diffraction.precomputation.recipe import Recipe
 from mitsuba_diffraction.render import parsed_scene, render
 from mitsuba_diffraction.render.scene import load_spectral_scene
 

@@ -16,7 +16,7 @@ import drjit as dr
 import mitsuba as mi
 
 from ..errors import RequestError
-from ..materials import RefractiveIndex
+from ..optics.materials import RefractiveIndex
 from .device_tables import opaque
 from .indices import Dispersion, absolute_index, index_from
 

@@ -7,7 +7,7 @@ from typing import cast
 import drjit as dr
 import mitsuba as mi
 
-from ..grating_spectrum import GratingSpectrum
+from ..precomputation.grating_spectrum import GratingSpectrum
 from ..spectrum.grids import SplineGrid, spline_weights
 from ..spectrum.tables import SliceTable
 from .continuum_sampler import BinSampler

@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.special import ndtr
 
-from ..grating_spectrum import GratingSpectrum
+from ..precomputation.grating_spectrum import GratingSpectrum
 from ..spectrum.grids import OrderGrid, spline_integral
 from .device_tables import PacketTable, ProbabilityTable, larger, opaque
 from .directions import Incidence

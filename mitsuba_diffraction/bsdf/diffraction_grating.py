@@ -9,9 +9,9 @@ from collections.abc import Sequence
 import mitsuba as mi
 
 from ..errors import RequestError
-from ..manual import Parameter, listed
-from ..materials import DISPERSION
-from ..recipe import MAX_PATCHES, Recipe, parameters_of_profile
+from ..optics.materials import DISPERSION
+from ..plugin_parameters import Parameter, listed
+from ..precomputation.recipe import MAX_PATCHES, Recipe, parameters_of_profile
 from ..surface.gratings import PROFILES, RENAMED
 from .base import base_from, living
 from .layers import Layers
@@ -155,9 +155,9 @@ first edge of each triangle and is discontinuous: add UVs. Where dp_du vanishes,
 
 The BRDF is R · K · G · S(q; κ)/λ² · E, with q = −(ω_i + ω_o)_∥/λ along the pattern's axes and
 κ = 2π (cos θ_i + cos θ_o)/λ. R is the power reflectance at the half vector (`fresnel.py`, with a film `thin_film.py`),
-K, G and the gain Γ of orders are computed in `geometry.py`, S in `orders.py` (orders) or `continuum.py` (a lattice). E
-(`energy_factor.py`) bounds the albedo by about one. Without shadowing there is no E, as K diverges near the horizon. In
-rigorous theory the BRDF is Σ_m η_m Γ N(q − m/T; σ_q² I)/λ² (`rigorous_orders.py`).
+K, G and the gain Γ of orders are computed in `optics/geometry.py`, S in `orders.py` (orders) or `continuum.py` (a
+lattice). E (`energy_factor.py`) bounds the albedo by about one. Without shadowing there is no E, as K diverges near the
+horizon. In rigorous theory the BRDF is Σ_m η_m Γ N(q − m/T; σ_q² I)/λ² (`rigorous_orders.py`).
 
 With transmission (`directions.py`), light is incident from above or below; transmitted light has the factor n_o², where
 n_o is the index of the medium of ω_o, and T instead of R. The flat face of a sheet reflects light from below

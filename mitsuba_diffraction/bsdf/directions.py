@@ -1,4 +1,4 @@
-"""Wave vectors, pairs of them, and the incident light at one wavelength, with the formulas of `../geometry.py`.
+"""Wave vectors, pairs of them, and the incident light at one wavelength, with the formulas of `../optics/geometry.py`.
 
 All lengths are in units that make the lateral scale of the relief one (`Scales` in `parameters.py`).
 
@@ -23,7 +23,7 @@ from dataclasses import dataclass
 import drjit as dr
 import mitsuba as mi
 
-from .. import geometry
+from ..optics import geometry
 from .device_tables import integer_part, larger, limited, smaller
 from .indices import Dispersion
 

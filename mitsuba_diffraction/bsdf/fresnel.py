@@ -9,8 +9,8 @@ import mitsuba as mi
 import numpy as np
 
 from ..errors import RequestError
-from ..film_stack import Stack
-from ..materials import MAX_INDEX, MIN_INDEX, RefractiveIndex, constant, index_of, is_file
+from ..optics.film_stack import Stack
+from ..optics.materials import MAX_INDEX, MIN_INDEX, RefractiveIndex, constant, index_of, is_file
 from .base import nested_plugin
 from .coat import Coat
 from .device_tables import opaque

@@ -10,8 +10,8 @@ import mitsuba as mi
 import numpy as np
 
 from ..errors import RequestError
+from ..precomputation.recipe import Recipe
 from ..progress import progress_bar
-from ..recipe import Recipe
 from .device_tables import BELOW_ONE, larger, limited, opaque, smaller
 from .directions import Geometry, Incidence, Interface, rotated
 from .energy_factor import Coordinates

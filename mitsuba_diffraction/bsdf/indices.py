@@ -7,7 +7,7 @@ import mitsuba as mi
 import numpy as np
 
 from ..errors import RequestError, is_number
-from ..materials import (
+from ..optics.materials import (
     DISPERSION,
     MAX_INDEX,
     MIN_INDEX,

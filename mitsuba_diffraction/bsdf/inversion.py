@@ -21,7 +21,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..energy.table import Layout
-from ..grating_spectrum import GratingSpectrum
+from ..precomputation.grating_spectrum import GratingSpectrum
 from .device_tables import BELOW_ONE, larger, limited, opaque
 from .directions import Incidence, cell_of, on_square
 

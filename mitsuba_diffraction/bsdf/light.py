@@ -7,8 +7,8 @@ import mitsuba as mi
 import numpy as np
 
 from ..errors import RequestError
-from ..llvm import is_supported
 from ..settings import VISIBLE
+from ..variants import is_supported
 from .base import gratings_in, parts
 
 STEP = 0.25  # nm, less than the width of a lamp's lines

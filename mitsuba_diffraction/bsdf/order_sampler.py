@@ -23,9 +23,9 @@ from scipy.ndimage import map_coordinates
 
 from ..energy.furnace import Furnace
 from ..energy.table import Layout, frequencies_of
-from ..film_stack import Stack
-from ..geometry import fresnel
-from ..grating_spectrum import GratingSpectrum
+from ..optics.film_stack import Stack
+from ..optics.geometry import fresnel
+from ..precomputation.grating_spectrum import GratingSpectrum
 from ..spectrum.grids import OrderGrid
 from .device_tables import NumberTable, PacketTable, integer_part, larger, opaque
 from .directions import Incidence, cell_of

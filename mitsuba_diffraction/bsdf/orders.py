@@ -12,7 +12,7 @@ import numpy as np
 import scipy.special
 
 from ..energy.furnace import small_kappa
-from ..grating_spectrum import GratingSpectrum
+from ..precomputation.grating_spectrum import GratingSpectrum
 from ..spectrum.grids import LobeAxis, OrderGrid
 from ..spectrum.tables import HALF_SCALE, AmplitudeTable, SliceTable, shared_exponents
 from .continuum_sampler import BinSampler

@@ -13,10 +13,10 @@ import mitsuba as mi
 import numpy as np
 
 from ..errors import RequestError, is_number
-from ..geometry import SHADOWING
-from ..materials import RefractiveIndex, is_file
-from ..precomputation import Spectrum, load_spectrum
-from ..recipe import REQUESTED, Recipe, source_named
+from ..optics.geometry import SHADOWING
+from ..optics.materials import RefractiveIndex, is_file
+from ..precomputation.recipe import REQUESTED, Recipe, source_named
+from ..precomputation.spectra import Spectrum, load_spectrum
 from ..rigorous.rigorous_spectrum import RigorousSpectrum
 from ..settings import (
     FROM_RADIUS,

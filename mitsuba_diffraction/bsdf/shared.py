@@ -12,8 +12,8 @@ import mitsuba as mi
 import numpy as np
 
 from ..energy.table import EnergyTable
-from ..film_stack import Stack
-from ..grating_spectrum import GratingSpectrum
+from ..optics.film_stack import Stack
+from ..precomputation.grating_spectrum import GratingSpectrum
 from ..settings import VISIBLE
 from ..spectrum.grids import OrderGrid
 from .continuum import SplineSpectrum

@@ -14,10 +14,10 @@ import numpy as np
 
 from ..energy.furnace import small_kappas
 from ..errors import RequestError
-from ..film_stack import Stack
-from ..geometry import SHADOWING
-from ..grating_spectrum import GratingSpectrum
-from ..precomputation import Spectrum
+from ..optics.film_stack import Stack
+from ..optics.geometry import SHADOWING
+from ..precomputation.grating_spectrum import GratingSpectrum
+from ..precomputation.spectra import Spectrum
 from ..rigorous.rigorous_spectrum import RigorousSpectrum
 from ..settings import VISIBLE
 from .coat import SAME_INDEX, Coat

@@ -1,7 +1,7 @@
 """Thin films on the relief: zinc sulphide of a hologram, the oxide of anodised titanium, the stack of a beetle.
 
-R and T of a plane under the films follow from the characteristic matrices of `../film_stack.py`, which E and samplers
-use as well (`film_stack.powers`: what changes |r|² or |t|² here changes it there). One film is evaluated
+R and T of a plane under the films follow from the characteristic matrices of `../optics/film_stack.py`, which E and
+samplers use as well (`film_stack.powers`: what changes |r|² or |t|² here changes it there). One film is evaluated
 without a loop. Several films are evaluated by a loop over a table of their indices, whose length is opaque.
 """
 
@@ -15,9 +15,9 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from .. import film_stack
 from ..errors import RequestError
-from ..materials import RefractiveIndex
+from ..optics import film_stack
+from ..optics.materials import RefractiveIndex
 from .device_tables import PacketTable, integer_part, larger, limited, opaque
 from .fresnel import Material, PerfectMirror
 from .indices import MAX_INDEX_NODES, Dispersion, index_from, nodes_of

@@ -15,9 +15,9 @@ import typer
 from numpy.typing import NDArray
 
 from ..errors import RequestError
-from ..files import refuse_other_than_utf8
+from ..files.writing import refuse_other_than_utf8
+from ..precomputation.recipe import Recipe, source_named
 from ..progress import say
-from ..recipe import Recipe, source_named
 from ..settings import SPECTRUM_PARAMETERS, SUN_COHERENCE_LENGTH, Settings
 from ..surface.gratings import PROFILES, RENAMED
 from ..surface.prepare import STEP_NAMES, step_of

@@ -10,13 +10,13 @@ import typer
 from numpy.typing import NDArray
 
 from ..errors import RequestError
+from ..files.outputs import check_outputs, free_name
+from ..files.picture_file import read_picture
 from ..inverse_design import Design, Verdict, makers
 from ..inverse_design import design as search
 from ..inverse_design.output import SUFFIXES, save
 from ..inverse_design.plate import for_detail
 from ..inverse_design.search import WHITE
-from ..outputs import check_outputs, free_name
-from ..picture_file import read_picture
 from ..progress import bytes_text, progress_bar, say, show, table, tell
 from .arguments import Overwrite, check_suffix, converted, parse_numbers
 from .render import Stopped

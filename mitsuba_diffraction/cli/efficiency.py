@@ -8,15 +8,15 @@ from typing import Annotated, Any
 
 import typer
 
-from ..efficiency import OrderEfficiencies, efficiencies
 from ..errors import RequestError
-from ..grating_spectrum import GratingSpectrum
-from ..outputs import check_outputs
-from ..peaks import check_request, peak_efficiencies
-from ..precomputation import load_spectrum
+from ..files.outputs import check_outputs
+from ..inspection.efficiency import OrderEfficiencies, efficiencies
+from ..inspection.peaks import check_request, peak_efficiencies
+from ..precomputation.grating_spectrum import GratingSpectrum
+from ..precomputation.recipe import Recipe, parameters_of_profile
+from ..precomputation.spectra import load_spectrum
 from ..progress import progress_bar, tell
-from ..recipe import Recipe, parameters_of_profile
-from ..scalar_theory import scalar_error
+from ..scalar_theory.validity import scalar_error
 from ..settings import ScalarSettings
 from .arguments import (
     Overwrite,

@@ -8,7 +8,7 @@ from typing import Annotated
 import typer
 
 from ..errors import RequestError
-from ..files import examples_folder, whole_file
+from ..files.writing import examples_folder, whole_file
 from ..progress import tell
 from .arguments import Overwrite
 

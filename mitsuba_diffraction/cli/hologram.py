@@ -8,10 +8,10 @@ from typing import Annotated
 
 import typer
 
-from .. import hologram as of_picture
 from ..errors import RequestError
-from ..files import examples_folder, whole_file
-from ..outputs import MARK, check_outputs
+from ..files.outputs import MARK, check_outputs
+from ..files.writing import examples_folder, whole_file
+from ..inverse_design import hologram as of_picture
 from ..progress import progress_bar, tell
 from .arguments import Overwrite
 from .render import render

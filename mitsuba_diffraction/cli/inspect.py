@@ -13,12 +13,12 @@ from rich.table import Table
 from rich.text import Text
 
 from ..errors import RequestError
+from ..files.outputs import check_outputs, free_name, plain, save_json
 from ..inspection import Inspection, save_picture
 from ..inspection import inspect as look
 from ..inspection.predicted_colours import GREEN, Colour, colours_at
-from ..outputs import check_outputs, free_name, plain, save_json
+from ..precomputation.recipe import source_named
 from ..progress import progress_bar, show, table, tell
-from ..recipe import source_named
 from ..settings import SUN_COHERENCE_LENGTH, lobe_width
 from .arguments import (
     Overwrite,

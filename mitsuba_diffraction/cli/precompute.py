@@ -8,9 +8,9 @@ from typing import Annotated
 import typer
 
 from ..errors import RequestError
-from ..outputs import check_outputs
+from ..files.outputs import check_outputs
+from ..precomputation.recipe import Recipe, source_named
 from ..progress import bytes_text, durations, progress_bar, stage, tell
-from ..recipe import Recipe, source_named
 from ..settings import ORIGINS, REPRESENTATIONS, SUN_COHERENCE_LENGTH, THEORIES
 from ..surface.prepare import is_seam_visible, seam_steps
 from .arguments import (

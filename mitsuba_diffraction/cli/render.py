@@ -12,12 +12,12 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from ..errors import RequestError
-from ..outputs import check_outputs, free_name
+from ..files.outputs import check_outputs, free_name
 from ..progress import bytes_text, durations, progress_bar, say, stage, tell
 from .arguments import Define, Overwrite, Variant, check_suffix, materials_of, scene_parameters
 
 if TYPE_CHECKING:
-    from ..color import ViewTransform
+    from ..optics.color import ViewTransform
     from ..render.passes import Estimate
     from ..render.spectral_image import SpectralImage
 
@@ -97,7 +97,7 @@ def render(
     overwrite: Overwrite = False,
 ) -> None:
     """Path-trace a scene into a spectral picture (.exr) with a preview (.png), or into a picture alone (.png, .jpg)."""
-    from ..color import neutral_view, ocio_view
+    from ..optics.color import neutral_view, ocio_view
 
     # Before Mitsuba, which takes more than a second to start.
     stored = {"half": False if single else None, "rgb": rgb, "channels": channels}
@@ -108,12 +108,12 @@ def render(
 
     import mitsuba as mi
 
-    from ..llvm import choose_variant
     from ..render.cluster import trace_on
     from ..render.parsed_scene import files_of_scene, has_alpha, named_sample_count
     from ..render.passes import checkpoint_path, trace_locally
     from ..render.turntable import animations_of, save_animation
     from ..render.turntable import orbit as motions_of_orbit
+    from ..variants import choose_variant
 
     where: dict[str, Any] = {"parameters": scene_parameters(define), "materials": materials_of(material)}
     reads = files_of_scene(scene, **where)

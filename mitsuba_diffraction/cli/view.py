@@ -10,10 +10,10 @@ from typing import Annotated, Any
 
 import typer
 
-from ..files import whole_file
-from ..outputs import check_outputs
+from ..files.outputs import check_outputs
+from ..files.writing import whole_file
+from ..precomputation.recipe import Recipe
 from ..progress import NAME, bytes_text, progress_bar, say, tell
-from ..recipe import Recipe
 from ..viewer.page import page, reference_picture
 from ..viewer.viewed_surface import Surface
 from .arguments import (

@@ -21,8 +21,9 @@ For an interface between media, the reflected and the transmitted fraction of li
     R(ω_i, λ) = ∫ F K G S(q; κ) Γ dq,    T(ω_i, λ) = ∫ F_t K_t G_t S(q; κ_t) Γ_t dq,    κ_t = 2π (cos θ_i − η cos θ_o)/λ
 
 with λ in the medium of ω_i, wave vectors in units of n_i, and S(q; −κ) = S(−q; κ). F and F_t are R and T of a plane at
-the half vector, of the films on the relief, if there are any (`film_stack.py`); F_t = 1 − F without them. Seen from
-below, the surface has the heights −h. A sheet uses the tables of an interface, as its flat face only removes light.
+the half vector, of the films on the relief, if there are any (`optics/film_stack.py`); F_t = 1 − F without them. Seen
+from below, the surface has the heights −h. A sheet uses the tables of an interface, as its flat face only removes
+light.
 """
 
 from __future__ import annotations
@@ -37,8 +38,8 @@ from numpy.polynomial.legendre import leggauss
 from numpy.typing import ArrayLike, NDArray
 from scipy.interpolate import CubicSpline
 
-from ..film_stack import Plane, Stack
-from ..geometry import AnyArray, fresnel, horizon_gain, k_g
+from ..optics.film_stack import Plane, Stack
+from ..optics.geometry import AnyArray, fresnel, horizon_gain, k_g
 from ..spectrum.grids import OrderGrid
 from ..spectrum.power_spectrum import PowerSpectrum
 

@@ -50,7 +50,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..errors import RequestError
-from ..film_stack import MAX_PHASE_STEP, Stack
+from ..optics.film_stack import MAX_PHASE_STEP, Stack
 from ..settings import usable_cores
 from ..spectrum.grids import OrderGrid
 from ..spectrum.power_spectrum import PowerSpectrum

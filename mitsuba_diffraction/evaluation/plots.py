@@ -6,8 +6,8 @@ import io
 import os
 from typing import TYPE_CHECKING
 
-from ..files import whole_file
-from ..outputs import png_text
+from ..files.outputs import png_text
+from ..files.writing import whole_file
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure

@@ -8,8 +8,8 @@ from collections.abc import Iterable, Mapping, Sequence
 from rich.table import Table
 from rich.text import Text
 
-from ..files import whole_file
-from ..outputs import MARK
+from ..files.outputs import MARK
+from ..files.writing import whole_file
 from .record import Record
 
 RECORD_COLUMNS = ("check", "expected", "found", "difference", "bound", "")

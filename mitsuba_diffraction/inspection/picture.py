@@ -10,10 +10,10 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
-from ..color import auto_exposure, into_gamut, on_screen, spectrum_to_linear_sRGB
 from ..errors import RequestError
-from ..files import whole_file
-from ..outputs import METADATA
+from ..files.outputs import METADATA
+from ..files.writing import whole_file
+from ..optics.color import auto_exposure, into_gamut, on_screen, spectrum_to_linear_sRGB
 from ..surface.heightfield import HeightField
 from ..surface.periods import hann, repeated, with_uncertainty
 from .predicted_colours import WAVELENGTHS, radiance

@@ -20,10 +20,10 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from scipy.ndimage import grey_dilation, grey_erosion
 
-from ..color import XYZ_to_linear_sRGB, daylight, delta_E, hex_code, into_gamut, spectrum_to_XYZ
 from ..errors import RequestError
-from ..geometry import k_g
-from ..grating_spectrum import GratingSpectrum
+from ..optics.color import XYZ_to_linear_sRGB, daylight, delta_E, hex_code, into_gamut, spectrum_to_XYZ
+from ..optics.geometry import k_g
+from ..precomputation.grating_spectrum import GratingSpectrum
 from ..settings import VISIBLE
 from ..surface.heightfield import HeightField
 from ..surface.periods import Period, find_periods

@@ -8,11 +8,11 @@ from dataclasses import dataclass, field
 import numpy as np
 from numpy.typing import NDArray
 
-from ..grating_spectrum import GratingSpectrum
-from ..outputs import plain
-from ..precomputation import precompute
+from ..files.outputs import plain
+from ..precomputation.grating_spectrum import GratingSpectrum
+from ..precomputation.spectra import precompute
 from ..progress import Progress, part, silent
-from ..scalar_theory import ScalarError, scalar_error
+from ..scalar_theory.validity import ScalarError, scalar_error
 from ..settings import SUN_COHERENCE_LENGTH, VISIBLE, ScalarSettings, lobe_width
 from ..spectrum.sample import effective_coherence_length, standard_error
 from ..surface.heightfield import HeightField

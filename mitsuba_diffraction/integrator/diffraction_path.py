@@ -8,7 +8,7 @@ import numpy as np
 
 from ..bsdf.base import nested_plugin
 from ..errors import RequestError
-from ..manual import Parameter, listed
+from ..plugin_parameters import Parameter, listed
 from .paths import Gratings, LightPaths, define_eye_paths, implements, unpacked
 
 PARAMETERS = (

@@ -10,8 +10,8 @@ from typing import Any
 import numpy as np
 
 from ..errors import RequestError
-from ..files import whole_file
-from ..outputs import MARK
+from ..files.outputs import MARK
+from ..files.writing import whole_file
 from ..surface.heightfield import HeightField
 from .far_field import Array
 from .output import simple_field

@@ -9,9 +9,9 @@ from typing import TYPE_CHECKING
 import numpy as np
 from PIL import Image
 
-from ..color import into_gamut, on_screen, plain_view
-from ..files import encoded_file, whole_file
-from ..outputs import MARK, METADATA
+from ..files.outputs import MARK, METADATA
+from ..files.writing import encoded_file, whole_file
+from ..optics.color import into_gamut, on_screen, plain_view
 from ..settings import VISIBLE, ScalarSettings
 from ..surface.heightfield import HeightField
 from .result import Design

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from ..errors import RequestError, check_whole, is_number
-from ..materials import index_of
+from ..optics.materials import index_of
 from ..settings import MIN_WAVELENGTH, VISIBLE
 from .far_field import Array, blurred_texels
 

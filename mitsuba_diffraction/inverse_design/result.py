@@ -9,9 +9,10 @@ from dataclasses import dataclass, field
 import numpy as np
 from numpy.typing import NDArray
 
-from ..color import delta_E, lamp_to_linear_sRGB, linear_sRGB_to_XYZ
-from ..geometry import diffracted
-from ..scalar_theory import scalar_error, tile_powers, transmitted_orders
+from ..optics.color import delta_E, lamp_to_linear_sRGB, linear_sRGB_to_XYZ
+from ..optics.geometry import diffracted
+from ..scalar_theory.closed_form import tile_powers, transmitted_orders
+from ..scalar_theory.validity import scalar_error
 from ..settings import lobe_width
 from ..surface.heightfield import HeightField
 from .far_field import Array, lobes_in_bins

@@ -7,8 +7,8 @@ import math
 import numpy as np
 from numpy.typing import ArrayLike
 
-from ..color import lamp_to_linear_sRGB, upsampled
 from ..errors import RequestError
+from ..optics.color import lamp_to_linear_sRGB, upsampled
 from .far_field import Array, lobes_in_bins
 from .plate import Plate
 

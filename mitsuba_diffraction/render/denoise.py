@@ -18,8 +18,8 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import fft
 
-from ..color import SRGB_TO_XYZ
 from ..errors import RequestError
+from ..optics.color import SRGB_TO_XYZ
 from .film import Rows
 from .spectral_image import split_rows
 

@@ -20,9 +20,9 @@ import mitsuba.parser
 import numpy as np
 
 from ..errors import RequestError, did_you_mean, root_cause
-from ..files import examples_folder, refuse_other_than_utf8, whole_file
+from ..files.writing import examples_folder, refuse_other_than_utf8, whole_file
+from ..precomputation.recipe import Recipe, source_named
 from ..progress import progress_bar
-from ..recipe import Recipe, source_named
 from .parser_state import children_of, resolved_file
 from .scene_materials import Materials, replace_materials
 

@@ -35,9 +35,9 @@ import mitsuba as mi
 import numpy as np
 from numpy.typing import NDArray
 
-from ..color import spectrum_to_XYZ
 from ..errors import RequestError
-from ..files import discard, exclusive, whole_file
+from ..files.writing import discard, exclusive, whole_file
+from ..optics.color import spectrum_to_XYZ
 from ..progress import bytes_text, stage
 from ..settings import VISIBLE
 from .film import (

@@ -14,7 +14,7 @@ import numpy as np
 from ..bsdf.base import gratings_in
 from ..bsdf.light import cover_light, recorded_wavelengths
 from ..errors import RequestError
-from ..llvm import is_supported
+from ..variants import is_supported
 from .parsed_scene import parsed
 from .parser_state import children_of
 from .scene_film import SpectralRange, replace_films

@@ -10,7 +10,7 @@ import mitsuba.parser
 
 from ..bsdf.diffraction_grating import check
 from ..errors import RequestError
-from ..recipe import theory_in
+from ..precomputation.recipe import theory_in
 from .parser_state import add_child, children_of, resolved_file
 
 _log = logging.getLogger(__name__)

@@ -14,7 +14,10 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from ..color import (
+from ..errors import RequestError
+from ..files.outputs import MARK, png_text
+from ..files.writing import encoded_file, whole_file
+from ..optics.color import (
     ViewTransform,
     XYZ_to_linear_sRGB,
     auto_exposure,
@@ -24,9 +27,6 @@ from ..color import (
     spectrum_to_linear_sRGB,
     spectrum_to_XYZ,
 )
-from ..errors import RequestError
-from ..files import encoded_file, whole_file
-from ..outputs import MARK, png_text
 from ..spectrum.exr import one_line, refuse_incomplete, silence
 
 _LAYOUT_VERSION = "1.0"

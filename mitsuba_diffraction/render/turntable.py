@@ -16,8 +16,8 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from ..files import encoded_file, whole_file
-from ..outputs import MARK
+from ..files.outputs import MARK
+from ..files.writing import encoded_file, whole_file
 from .scene import load_spectral_scene
 from .scene_materials import Materials
 

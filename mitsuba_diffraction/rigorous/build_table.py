@@ -19,8 +19,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..errors import RequestError
-from ..files import whole_file
-from ..materials import index_of, refractive_index
+from ..files.writing import whole_file
+from ..optics.materials import index_of, refractive_index
 from ..progress import Progress, silent, stage
 from ..settings import RigorousSettings, usable_cores
 from ..surface.heightfield import HeightField

@@ -14,8 +14,8 @@ from numpy.typing import ArrayLike, NDArray
 from threadpoolctl import ThreadpoolController
 
 from ..errors import RequestError
-from ..geometry import Orders
-from ..materials import refractive_index
+from ..optics.geometry import Orders
+from ..optics.materials import refractive_index
 from ..surface.heightfield import HeightField
 from .coordinate_transformation import ABOVE, BELOW, Curve, CurveMatrices, Scattered, curve_of, half_space, scatter
 

@@ -16,8 +16,8 @@ import numpy as np
 import OpenEXR
 
 from ..errors import RequestError
-from ..files import UNSEALED, is_intact, seal, whole_file
-from ..outputs import MARK
+from ..files.outputs import MARK
+from ..files.writing import UNSEALED, is_intact, seal, whole_file
 
 # Streams belong to the whole process, and Mitsuba loads plugins on several threads.
 _silencing = threading.Lock()

@@ -8,8 +8,8 @@ from collections.abc import Mapping
 from typing import Any
 
 from ..errors import RequestError
-from ..grating_spectrum import GratingSpectrum
-from ..recipe import Recipe
+from ..precomputation.grating_spectrum import GratingSpectrum
+from ..precomputation.recipe import Recipe
 from .page import page
 from .viewed_surface import Surface, material_from
 

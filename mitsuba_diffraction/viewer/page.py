@@ -14,8 +14,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..errors import RequestError
-from ..materials import conductor
-from ..outputs import MARK
+from ..files.outputs import MARK
+from ..optics.materials import conductor
 from ..settings import FROM_RADIUS, SUN_COHERENCE_LENGTH, VISIBLE
 from ..spectrum.grids import OrderGrid
 from ..spectrum.sample import effective_coherence_length, window_axes
@@ -88,7 +88,7 @@ def page(surface: Surface, *others: Surface, picture: NDArray[np.float16] | None
 
 def reference_picture(path: str | os.PathLike[str]) -> NDArray[np.float16]:
     """Return a spectral picture as linear sRGB in half precision, (height, width, 3), the lowest row first."""
-    from ..color import spectrum_to_linear_sRGB
+    from ..optics.color import spectrum_to_linear_sRGB
     from ..render.spectral_image import SpectralImage
 
     image = SpectralImage.load(path)

@@ -10,12 +10,12 @@ from pathlib import Path
 from typing import Any
 
 from ..errors import RequestError, is_number
-from ..files import examples_folder
-from ..grating_spectrum import GratingSpectrum
-from ..materials import refractive_index
-from ..precomputation import Spectrum, load_spectrum
+from ..files.writing import examples_folder
+from ..optics.materials import refractive_index
+from ..precomputation.grating_spectrum import GratingSpectrum
+from ..precomputation.recipe import Recipe, parameters_of_profile, source_named
+from ..precomputation.spectra import Spectrum, load_spectrum
 from ..progress import Progress, no_progress
-from ..recipe import Recipe, parameters_of_profile, source_named
 from ..settings import FROM_RADIUS, VISIBLE, wavelengths_inside
 from ..spectrum.tables import SliceTable
 from ..surface.gratings import PROFILES

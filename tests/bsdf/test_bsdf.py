@@ -19,8 +19,8 @@ from bsdf_support import (
 )
 
 import mitsuba_diffraction as md
+from mitsuba_diffraction.bsdf.testing import evaluate_pdf
 from mitsuba_diffraction.settings import lobe_width
-from mitsuba_diffraction.testing import evaluate_pdf
 
 MAKE = {
     "flat": lambda: md.HeightField(np.zeros((1, 4)), 0.05),
@@ -263,7 +263,9 @@ def test_mistakes_are_refused(llvm, parameters, text):
 
 @pytest.mark.parametrize("source", ["profile", "recipe"])
 def test_parameters_of_scalar_theory_are_refused_before_a_table_is_computed(llvm, monkeypatch, tmp_path, source):
-    monkeypatch.setattr("mitsuba_diffraction.recipe.Recipe.cached", lambda *_: pytest.fail("a table was computed"))
+    monkeypatch.setattr(
+        "mitsuba_diffraction.precomputation.recipe.Recipe.cached", lambda *_: pytest.fail("a table was computed")
+    )
     recipe = tmp_path / "blazed.toml"
     recipe.write_text('[surface]\nprofile = "blazed"\n[spectrum]\ntheory = "rigorous"\nmaterial = "Al"\n')
     of = {"profile": "blazed", "theory": "rigorous", "material": "Al"}

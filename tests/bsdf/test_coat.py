@@ -7,8 +7,7 @@ from bsdf_support import array, check_chi_square, direction, interaction, random
 
 import mitsuba_diffraction as md
 from mitsuba_diffraction import testing
-from mitsuba_diffraction.geometry import k_g
-from mitsuba_diffraction.scalar_theory import fresnel
+from mitsuba_diffraction.optics.geometry import fresnel, k_g
 
 INDEX = 1.55
 GRATING = {"type": "diffraction_grating", "coherence_length": 3.0}

@@ -8,7 +8,7 @@ from scipy.special import jv
 from test_bsdf import evaluate, k_g, random_directions, raw_plugin, towards
 
 import mitsuba_diffraction as md
-from mitsuba_diffraction.geometry import horizon_gain
+from mitsuba_diffraction.optics.geometry import horizon_gain
 from mitsuba_diffraction.settings import lobe_width
 from mitsuba_diffraction.spectrum.grids import OrderGrid
 

@@ -11,12 +11,10 @@ import pytest
 from bsdf_support import check_chi_square, direction, evaluate, interaction, made_up, random_directions, use, vectors
 
 import mitsuba_diffraction as md
-from mitsuba_diffraction import testing
-from mitsuba_diffraction.bsdf import shared
-from mitsuba_diffraction.geometry import horizon_gain
+from mitsuba_diffraction.bsdf import shared, testing
+from mitsuba_diffraction.optics.geometry import fresnel, horizon_gain
 from mitsuba_diffraction.rigorous.rigorous_spectrum import RigorousSpectrum
 from mitsuba_diffraction.rigorous.solver import mueller
-from mitsuba_diffraction.scalar_theory import fresnel
 
 SURFACE = {"profile": "blazed", "period": 0.3, "depth": 0.05, "samples": 64}
 SETTINGS = {"theory": "rigorous", "int_ior": 1.5, "wavelengths": [400.0, 500.0], "tolerance": 0.02, "polarised": True}

@@ -128,7 +128,7 @@ def anew(monkeypatch):
     """A function that forgets which spectra are in use and what was logged, as a new process does."""
 
     def forget():
-        monkeypatch.setattr("mitsuba_diffraction.recipe._in_use", weakref.WeakValueDictionary())
+        monkeypatch.setattr("mitsuba_diffraction.precomputation.recipe._in_use", weakref.WeakValueDictionary())
         theory._warn.cache_clear()
 
     forget()

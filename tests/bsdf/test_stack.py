@@ -8,8 +8,9 @@ import tmm
 from bsdf_support import bitmap, direction, draw, evaluate, floats, interaction, six_samples, use
 from test_thin_film import load, material_of, pairs, powers
 
-from mitsuba_diffraction import film_stack, testing
-from mitsuba_diffraction.materials import constant, index_of, refractive_index
+from mitsuba_diffraction import testing
+from mitsuba_diffraction.optics import film_stack
+from mitsuba_diffraction.optics.materials import constant, index_of, refractive_index
 
 WAVELENGTHS = (420.0, 500.0, 580.0, 660.0)
 STACK = {"thin_film_ior": "3 x (2.35, 1.38)", "thin_film_thickness": "3 x (0.06, 0.1)"}

@@ -21,7 +21,7 @@ from bsdf_support import (
 )
 
 import mitsuba_diffraction as md
-from mitsuba_diffraction.materials import refractive_index
+from mitsuba_diffraction.optics.materials import refractive_index
 
 WAVELENGTHS = np.linspace(400, 800, 9)
 ANGLES = np.arange(0.0, 81.0, 10)

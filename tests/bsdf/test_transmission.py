@@ -14,8 +14,8 @@ import mitsuba_diffraction as md
 from mitsuba_diffraction import testing
 from mitsuba_diffraction.bsdf.directions import Geometry, Incidence, Interface
 from mitsuba_diffraction.bsdf.order_sampler import OrderSampler
-from mitsuba_diffraction.film_stack import Stack
-from mitsuba_diffraction.materials import constant
+from mitsuba_diffraction.optics.film_stack import Stack
+from mitsuba_diffraction.optics.materials import constant
 
 PERIOD, ETA, WAVELENGTH = 3.35, 1.5, 0.5
 IMPORTANCE = mi.TransportMode.Importance

@@ -333,7 +333,7 @@ def test_an_interrupt_leaves_no_file(command, monkeypatch, place):
         raise KeyboardInterrupt
 
     if place == "precompute":
-        monkeypatch.setattr("mitsuba_diffraction.recipe.build_spectrum", interrupted)
+        monkeypatch.setattr("mitsuba_diffraction.precomputation.recipe.build_spectrum", interrupted)
     else:
         monkeypatch.setattr(OpenEXR.File, "write", interrupted, raising=True)
     before = files()
@@ -348,7 +348,7 @@ def test_a_failure_is_one_line_and_exit_code_1(command, monkeypatch, error):
     def fail(*arguments, **named):
         raise error
 
-    monkeypatch.setattr("mitsuba_diffraction.recipe.build_spectrum", fail)
+    monkeypatch.setattr("mitsuba_diffraction.precomputation.recipe.build_spectrum", fail)
     code, out, err = command("precompute", "blaze.toml")
     assert (code, out) == (1, "")
     assert err.strip() == f"mitsuba-diffraction: error: {str(error) or 'MemoryError'}"
@@ -364,7 +364,7 @@ def broadcast(*arguments, **named):
 
 
 def test_a_bug_is_reported_as_such(command, monkeypatch):
-    monkeypatch.setattr("mitsuba_diffraction.recipe.build_spectrum", broadcast)
+    monkeypatch.setattr("mitsuba_diffraction.precomputation.recipe.build_spectrum", broadcast)
     code, out, err = command("precompute", "blaze.toml")
     assert (code, out) == (1, "")
     assert err == f"{BUG}ValueError: {BROADCAST}); mitsuba-diffraction --debug … shows where\n"
@@ -554,7 +554,9 @@ def test_the_installed_command_ends_with_its_exit_code(folder):
 
 
 def test_precompute_refuses_an_unwritable_target_before_the_work(command, monkeypatch):
-    monkeypatch.setattr("mitsuba_diffraction.recipe.build_spectrum", lambda *_, **__: pytest.fail("it went to work"))
+    monkeypatch.setattr(
+        "mitsuba_diffraction.precomputation.recipe.build_spectrum", lambda *_, **__: pytest.fail("it went to work")
+    )
     code, _, err = command("precompute blaze.toml -o nowhere/out.exr")
     assert (code, err.count("got nowhere/out.exr, but the folder nowhere is not there")) == (2, 1)
 

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from PIL import Image
 
-import mitsuba_diffraction.hologram as of_picture
+import mitsuba_diffraction.inverse_design.hologram as of_picture
 
 hologram = importlib.import_module("mitsuba_diffraction.cli.hologram")  # the package has the command by this name
 

@@ -15,12 +15,12 @@ import pytest
 from PIL import Image
 
 import mitsuba_diffraction as md
-from mitsuba_diffraction import outputs
-from mitsuba_diffraction.files import is_intact, refuse_unwritable, seal, whole_file
+from mitsuba_diffraction.files import outputs
+from mitsuba_diffraction.files.outputs import check_outputs
+from mitsuba_diffraction.files.writing import is_intact, refuse_unwritable, seal, whole_file
 from mitsuba_diffraction.inverse_design import Design, makers, output
 from mitsuba_diffraction.inverse_design.plate import Plate
 from mitsuba_diffraction.inverse_design.target import wanted_fractions
-from mitsuba_diffraction.outputs import check_outputs
 from mitsuba_diffraction.render.parsed_scene import files_of_scene
 from mitsuba_diffraction.render.spectral_image import SpectralImage, save_preview
 from mitsuba_diffraction.render.turntable import save_animation
@@ -259,7 +259,7 @@ def test_every_format_carries_the_mark(name):
 # --- several at once, and kills ---
 
 WRITER = """import sys
-from mitsuba_diffraction.files import whole_file
+from mitsuba_diffraction.files.writing import whole_file
 with whole_file("target.bin") as temporary:
     for _ in range(50):
         temporary.write_bytes(sys.argv[1].encode() * 100_000)

@@ -13,8 +13,7 @@ from bsdf_support import array, floats, plugin, vectors
 from scipy.ndimage import gaussian_filter
 
 import mitsuba_diffraction as md
-from mitsuba_diffraction import testing
-from mitsuba_diffraction.bsdf import shared
+from mitsuba_diffraction.bsdf import shared, testing
 from mitsuba_diffraction.energy.furnace import Furnace
 from mitsuba_diffraction.energy.table import MAX_E, EnergyTable
 

@@ -22,13 +22,13 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
+from mitsuba_diffraction.bsdf.testing import direction, towards
 from mitsuba_diffraction.evaluation.record import Record
 from mitsuba_diffraction.evaluation.validation.analytic import compare_orders
 from mitsuba_diffraction.evaluation.validation.lobes import density, grating, spectrum_of
-from mitsuba_diffraction.grating_spectrum import GratingSpectrum
+from mitsuba_diffraction.precomputation.grating_spectrum import GratingSpectrum
 from mitsuba_diffraction.settings import lobe_width
 from mitsuba_diffraction.surface.heightfield import HeightField
-from mitsuba_diffraction.testing import direction, towards
 
 Array = NDArray[np.float64]
 

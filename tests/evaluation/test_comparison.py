@@ -12,13 +12,13 @@ from bsdf_support import made_up
 from PIL import Image
 
 import mitsuba_diffraction as md
-from mitsuba_diffraction.color import delta_E, spectrum_to_XYZ
 from mitsuba_diffraction.evaluation.comparison import compare, summary
 from mitsuba_diffraction.evaluation.comparison.difference import difference, noise, time_of_error, white_luminance
 from mitsuba_diffraction.evaluation.comparison.pictures import NO_SHADOWS, Pictures, supported_lights
 from mitsuba_diffraction.evaluation.comparison.quirk_shares import quirk_shares
 from mitsuba_diffraction.evaluation.realtime_shader.evaluate import VARIANTS
 from mitsuba_diffraction.evaluation.realtime_shader.quirks import Quirks
+from mitsuba_diffraction.optics.color import delta_E, spectrum_to_XYZ
 from mitsuba_diffraction.render.scene_film import channel_wavelengths, channel_weights
 
 # A sphere above a plate, with a pigment; broad lobes, so that small pictures resolve them.

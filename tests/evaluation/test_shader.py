@@ -10,6 +10,7 @@ import pytest
 from scipy.special import diric
 
 import mitsuba_diffraction as md
+from mitsuba_diffraction.bsdf.testing import array, vectors
 from mitsuba_diffraction.errors import root_cause
 from mitsuba_diffraction.evaluation.realtime_shader import tristimulus
 from mitsuba_diffraction.evaluation.realtime_shader.evaluate import VARIANTS, colour, relative_radiance, shader_for
@@ -17,7 +18,6 @@ from mitsuba_diffraction.evaluation.realtime_shader.nmm_pq import line_area
 from mitsuba_diffraction.evaluation.realtime_shader.pq import tile_factor, tiling_power
 from mitsuba_diffraction.evaluation.realtime_shader.quirks import Quirks
 from mitsuba_diffraction.evaluation.realtime_shader.taylor_textures import series_error, taylor_transforms
-from mitsuba_diffraction.testing import array, vectors
 
 PUBLISHED, CORRECTED = Quirks.as_published(), Quirks.corrected()
 BLAZE = md.gratings.blazed(2.5, 0.25, samples=64)
@@ -507,7 +507,7 @@ def test_texels_are_the_transforms_of_the_powers_of_the_heights():
 
 
 def test_spectra_of_the_primaries_have_their_colours():
-    from mitsuba_diffraction.color import spectrum_to_linear_sRGB
+    from mitsuba_diffraction.optics.color import spectrum_to_linear_sRGB
 
     spectra = tristimulus.primary_spectra()
     assert spectra.min() > -1e-6

@@ -10,13 +10,16 @@ import numpy as np
 import pytest
 
 import mitsuba_diffraction as md
-from mitsuba_diffraction import geometry, outputs, rigorous, scalar_theory
+from mitsuba_diffraction import rigorous, scalar_theory
 from mitsuba_diffraction.evaluation import report
 from mitsuba_diffraction.evaluation.benchmark.accuracy import against_reference
 from mitsuba_diffraction.evaluation.record import Check, Record
 from mitsuba_diffraction.evaluation.validation import analytic, conservation, coupled_waves
 from mitsuba_diffraction.evaluation.validation.checks import checks, scalar_range, surface_checks
+from mitsuba_diffraction.files import outputs
+from mitsuba_diffraction.optics import geometry
 from mitsuba_diffraction.rigorous.solver import converge
+from mitsuba_diffraction.scalar_theory import closed_form, validity
 
 TOOLS = Path(__file__).parents[2] / "tools" / "data"
 CHECKS = checks()
@@ -91,12 +94,12 @@ def test_checks_see_a_wrong_period():
 
 def test_scalar_orders_are_those_of_the_sinusoid():
     """In a plane mirror's limit, and J_m² by two ways."""
-    sampled = scalar_theory.profile_powers(md.gratings.sinusoidal(2.5, 0.25))
-    exact = scalar_theory.sinusoid_powers(0.25)
-    found, expected = (scalar_theory.scalar_orders(powers, 2.5, 0.5, 20.0, 1.5) for powers in (sampled, exact))
+    sampled = closed_form.profile_powers(md.gratings.sinusoidal(2.5, 0.25))
+    exact = closed_form.sinusoid_powers(0.25)
+    found, expected = (closed_form.scalar_orders(powers, 2.5, 0.5, 20.0, 1.5) for powers in (sampled, exact))
     np.testing.assert_array_equal(found.m, expected.m)
     np.testing.assert_allclose(found.unpolarised, expected.unpolarised, atol=1e-12)
-    flat = scalar_theory.scalar_orders(scalar_theory.sinusoid_powers(0.0), 2.5, 0.5, 40.0, 1.5)
+    flat = closed_form.scalar_orders(closed_form.sinusoid_powers(0.0), 2.5, 0.5, 40.0, 1.5)
     (mirror,) = np.flatnonzero(flat.s > 1e-12)
     assert flat.m[mirror] == 0
     s, p = geometry.fresnel(np.cos(np.deg2rad(40)), 1.5)
@@ -139,8 +142,8 @@ def test_the_map_is_that_of_the_solver(material):
         light = np.sin(theta) * np.cos(phi), np.sin(theta) * np.sin(phi), np.cos(theta)
         surface = md.gratings.sinusoidal(period, depth, samples=300)
         exact = rigorous.efficiencies(surface, light, 1.0, int_ior=index)
-        powers = scalar_theory.profile_powers(surface)
-        scalar = scalar_theory.scalar_orders(powers, period, 1.0, angle, index, azimuth)
+        powers = closed_form.profile_powers(surface)
+        scalar = closed_form.scalar_orders(powers, period, 1.0, angle, index, azimuth)
         np.testing.assert_array_equal(scalar.m, exact.orders)
         found = scalar_theory.efficiency_difference(scalar.unpolarised, exact.unpolarised)
         assert found == pytest.approx(errors[i, j, k], rel=0.03, abs=0.003)
@@ -155,8 +158,8 @@ def test_the_map_of_transmitted_light_agrees_with_the_solver(way, period, depth,
     sine = np.sin(np.deg2rad(angle)) / (1.5 if below else 1)
     light = (-sine, 0, np.sqrt(1 - sine**2) * (-1 if below else 1))
     exact = rigorous.efficiencies(md.gratings.sinusoidal(period, depth, samples=512), light, 1.0, int_ior=1.5)
-    found = scalar_theory.transmitted_orders(
-        scalar_theory.sinusoid_powers(depth), period, 1.0, angle, 1.5, from_below=below
+    found = closed_form.transmitted_orders(
+        closed_form.sinusoid_powers(depth), period, 1.0, angle, 1.5, from_below=below
     )
     np.testing.assert_array_equal(found.m, exact.transmitted_orders)
     assert scalar_theory.efficiency_difference(found.unpolarised, exact.transmission.unpolarised) == pytest.approx(
@@ -202,8 +205,8 @@ def test_built_in_surfaces_of_long_period_raise_no_warning():
 
 def test_error_of_a_profile_is_that_of_coupled_waves(monkeypatch):
     """The stored results of meent for a blaze of 2.5 × 0.25 µm."""
-    monkeypatch.setattr(scalar_theory, "ERROR_WAVELENGTHS", (0.45, 0.65))
-    monkeypatch.setattr(scalar_theory, "ERROR_ANGLES", (0.0, 20.0))
+    monkeypatch.setattr(validity, "ERROR_WAVELENGTHS", (0.45, 0.65))
+    monkeypatch.setattr(validity, "ERROR_ANGLES", (0.0, 20.0))
     stored = [
         scalar_theory.efficiency_difference(case.scalar().unpolarised, case.unpolarised)
         for case in coupled_waves.cases()
@@ -223,7 +226,7 @@ def test_equal_profiles_are_solved_once(monkeypatch):
         solved.append(arguments)
         return converge(*arguments)
 
-    monkeypatch.setattr(scalar_theory, "converge", counted)
+    monkeypatch.setattr(validity, "converge", counted)
     first = scalar_theory.scalar_error(md.gratings.sinusoidal(1.07, 0.011, samples=32))
     assert len(solved) == 9
     assert scalar_theory.scalar_error(md.gratings.sinusoidal(1.07, 0.011, samples=32)) == first
@@ -279,7 +282,7 @@ def test_estimated_error_is_near_the_solved_one(count):
         # The same tile, called a surface in two dimensions, is not solved.
         solved = scalar_theory.scalar_error(profile)
         with pytest.MonkeyPatch.context() as patch:
-            patch.setattr(scalar_theory, "is_profile", lambda surface: False)
+            patch.setattr(validity, "is_profile", lambda surface: False)
             estimated = scalar_theory.scalar_error(profile)
         assert (solved.estimated, estimated.estimated) == (False, True)
         factors.append(np.log(estimated.share / solved.share))
@@ -402,7 +405,7 @@ def test_a_tilt_does_not_count_as_roughness():
     waves = np.tile(0.05 * np.cos(2 * np.pi * x / 2.0), (150, 1))
     level, tilted = (scalar_range(md.HeightField(waves + slope * x, 0.08), "sample").measured for slope in (0.0, 0.1))
     assert tilted == pytest.approx(level, rel=1e-3)
-    of_wave = [scalar_theory.expected_error(2.0, 0.1, each, mean=True) for each in scalar_theory.ERROR_WAVELENGTHS]
+    of_wave = [scalar_theory.expected_error(2.0, 0.1, each, mean=True) for each in validity.ERROR_WAVELENGTHS]
     assert level == pytest.approx(np.mean(of_wave), rel=0.1)  # the window broadens the wave
 
 

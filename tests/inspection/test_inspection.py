@@ -15,7 +15,6 @@ from scipy.special import jv
 
 import mitsuba_diffraction as md
 from mitsuba_diffraction import testing
-from mitsuba_diffraction.color import into_gamut, spectrum_to_linear_sRGB, spectrum_to_XYZ
 from mitsuba_diffraction.inspection import inspect, picture, save_picture
 from mitsuba_diffraction.inspection.picture import piece_shown, with_uncertainty
 from mitsuba_diffraction.inspection.predicted_colours import (
@@ -29,7 +28,8 @@ from mitsuba_diffraction.inspection.predicted_colours import (
     scanned,
 )
 from mitsuba_diffraction.inspection.properties import concerns, statistics
-from mitsuba_diffraction.scalar_theory import scalar_error
+from mitsuba_diffraction.optics.color import into_gamut, spectrum_to_linear_sRGB, spectrum_to_XYZ
+from mitsuba_diffraction.scalar_theory.validity import scalar_error
 
 ROOT = Path(__file__).parents[2]
 PERIOD, DEPTH = 2.0, 0.2

@@ -15,7 +15,7 @@ from mitsuba_diffraction.inverse_design.plate import Plate
 from mitsuba_diffraction.inverse_design.search import WHITE
 from mitsuba_diffraction.inverse_design.target import wanted_fractions
 from mitsuba_diffraction.inverse_design.verdict import GOOD_BOUNDS, VISIBLE_BOUNDS
-from mitsuba_diffraction.recipe import Recipe
+from mitsuba_diffraction.precomputation.recipe import Recipe
 
 SMALL = {"texel": 1.0, "texels": 16, "starts": 6, "seen_on": "screen"}
 

@@ -8,9 +8,9 @@ from PIL import Image
 
 import mitsuba_diffraction as md
 from mitsuba_diffraction import cli
-from mitsuba_diffraction.outputs import check_outputs
-from mitsuba_diffraction.picture_file import read_picture
-from mitsuba_diffraction.recipe import Recipe
+from mitsuba_diffraction.files.outputs import check_outputs
+from mitsuba_diffraction.files.picture_file import read_picture
+from mitsuba_diffraction.precomputation.recipe import Recipe
 
 OPTIONS = "--texel 1 --texels 12 --wavelength 532 --starts 1"
 

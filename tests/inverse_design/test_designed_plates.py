@@ -7,7 +7,7 @@ import designed_plates
 import numpy as np
 import pytest
 
-from mitsuba_diffraction.scalar_theory import efficiency_difference
+from mitsuba_diffraction.scalar_theory.closed_form import efficiency_difference
 
 ROOT = Path(__file__).parents[2]
 CASES = json.loads(designed_plates.STORED.read_text(encoding="utf-8"))["cases"]

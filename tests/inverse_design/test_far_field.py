@@ -11,7 +11,7 @@ from mitsuba_diffraction.inverse_design.far_field import blurred_texels, lobes_i
 from mitsuba_diffraction.inverse_design.plate import Plate, for_detail
 from mitsuba_diffraction.inverse_design.search import far_field_of
 from mitsuba_diffraction.inverse_design.target import wanted_fractions, with_unused
-from mitsuba_diffraction.reference import order_powers
+from mitsuba_diffraction.scalar_theory.reference import order_powers
 from mitsuba_diffraction.settings import lobe_width
 from mitsuba_diffraction.surface.heightfield import HeightField
 

@@ -15,7 +15,7 @@ import pytest
 from PIL import Image
 
 import mitsuba_diffraction  # noqa: F401 (settles which LLVM is used before a variant is set)
-from mitsuba_diffraction.color import spectrum_to_XYZ
+from mitsuba_diffraction.optics.color import spectrum_to_XYZ
 from mitsuba_diffraction.render import SpectralImage, film, passes, render
 from mitsuba_diffraction.render.film import LightOfBands, bands_of, trace_pass
 from mitsuba_diffraction.render.passes import BandedImage, Interrupted, trace_locally

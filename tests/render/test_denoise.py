@@ -10,7 +10,7 @@ from bsdf_support import grating, uniform, use
 from PIL import Image
 
 import mitsuba_diffraction  # noqa: F401 (settles which LLVM is used before a variant is set)
-from mitsuba_diffraction.color import XYZ_to_linear_sRGB, into_gamut, matching_functions
+from mitsuba_diffraction.optics.color import XYZ_to_linear_sRGB, into_gamut, matching_functions
 from mitsuba_diffraction.render import denoise
 from mitsuba_diffraction.render.denoise import Guides, denoised, denoised_picture, guides, is_requested
 

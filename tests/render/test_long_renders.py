@@ -17,8 +17,8 @@ import pytest
 from PIL import Image
 
 import mitsuba_diffraction  # noqa: F401 (settles which LLVM is used before a variant is set)
-from mitsuba_diffraction.color import spectrum_to_XYZ
-from mitsuba_diffraction.files import exclusive
+from mitsuba_diffraction.files.writing import exclusive
+from mitsuba_diffraction.optics.color import spectrum_to_XYZ
 from mitsuba_diffraction.render import SpectralImage, passes, render
 from mitsuba_diffraction.render.parsed_scene import scene_digest
 from mitsuba_diffraction.render.passes import (

@@ -297,7 +297,9 @@ def test_an_unknown_id_is_refused_with_the_known_ids(exported):
     ],
 )
 def test_wrong_parameters_are_refused_before_a_spectrum_is_computed(exported, monkeypatch, values, text):
-    monkeypatch.setattr("mitsuba_diffraction.recipe.Recipe.cached", lambda *_: pytest.fail("a spectrum was computed"))
+    monkeypatch.setattr(
+        "mitsuba_diffraction.precomputation.recipe.Recipe.cached", lambda *_: pytest.fail("a spectrum was computed")
+    )
     with pytest.raises((ValueError, FileNotFoundError), match=text):
         load_spectral_scene(exported(), materials={"mat-Floor": MIRROR, "mat-Disc": values})
 

@@ -13,8 +13,8 @@ from PIL import Image
 
 import mitsuba_diffraction  # noqa: F401 (settles which LLVM is used before a variant is set)
 from mitsuba_diffraction.bsdf.device_tables import PacketTable
-from mitsuba_diffraction.color import spectrum_to_linear_sRGB, spectrum_to_XYZ
 from mitsuba_diffraction.errors import Bug, RequestError
+from mitsuba_diffraction.optics.color import spectrum_to_linear_sRGB, spectrum_to_XYZ
 from mitsuba_diffraction.render import film, passes, render
 from mitsuba_diffraction.render.film import trace_pass
 from mitsuba_diffraction.render.scene import load_spectral_scene

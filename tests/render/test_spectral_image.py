@@ -7,8 +7,8 @@ import OpenEXR
 import pytest
 from PIL import Image
 
-from mitsuba_diffraction.color import spectrum_to_linear_sRGB
-from mitsuba_diffraction.files import whole_file
+from mitsuba_diffraction.files.writing import whole_file
+from mitsuba_diffraction.optics.color import spectrum_to_linear_sRGB
 from mitsuba_diffraction.render import spectral_image
 from mitsuba_diffraction.render.spectral_image import SpectralImage, save_preview
 

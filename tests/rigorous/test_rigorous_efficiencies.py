@@ -8,7 +8,9 @@ import pytest
 
 from mitsuba_diffraction import HeightField, gratings, rigorous
 from mitsuba_diffraction.evaluation.validation.coupled_waves import SOLVED_PROFILES, cases
-from mitsuba_diffraction.scalar_theory import fresnel, profile_powers, scalar_error, scalar_orders
+from mitsuba_diffraction.optics.geometry import fresnel
+from mitsuba_diffraction.scalar_theory.closed_form import profile_powers, scalar_orders
+from mitsuba_diffraction.scalar_theory.validity import scalar_error
 
 SCATMECH = json.loads((Path(__file__).parents[1] / "data" / "scatmech.json").read_text(encoding="utf-8"))
 CONICAL = np.array([-0.3, 0.35, 0.887])

@@ -10,10 +10,10 @@ from hypothesis import strategies as st
 
 import mitsuba_diffraction as md
 from mitsuba_diffraction import gratings, rigorous
+from mitsuba_diffraction.optics.geometry import fresnel
 from mitsuba_diffraction.rigorous import build_table
 from mitsuba_diffraction.rigorous.build_table import build_rigorous
 from mitsuba_diffraction.rigorous.rigorous_spectrum import Axes, RigorousSpectrum, interval_bounds, interval_of
-from mitsuba_diffraction.scalar_theory import fresnel
 from mitsuba_diffraction.settings import RigorousSettings
 
 SURFACE = gratings.blazed(0.3, 0.05, samples=64)

@@ -5,7 +5,7 @@ import pytest
 from volume_integral import extrapolated, solve
 
 from mitsuba_diffraction import gratings, rigorous
-from mitsuba_diffraction.scalar_theory import efficiency_difference, incident_direction
+from mitsuba_diffraction.scalar_theory.closed_form import efficiency_difference, incident_direction
 
 WAVELENGTH, INDEX = 0.55, 1.5
 

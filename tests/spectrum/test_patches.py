@@ -6,8 +6,8 @@ import pytest
 
 import mitsuba_diffraction as md
 from mitsuba_diffraction import Recipe
-from mitsuba_diffraction.grating_spectrum import GratingSpectrum
-from mitsuba_diffraction.reference import order_powers, power_spectrum
+from mitsuba_diffraction.precomputation.grating_spectrum import GratingSpectrum
+from mitsuba_diffraction.scalar_theory.reference import order_powers, power_spectrum
 from mitsuba_diffraction.settings import ScalarSettings, lobe_width
 from mitsuba_diffraction.surface.gratings import COHERENCE_LENGTHS, PATCHES, PROFILES
 

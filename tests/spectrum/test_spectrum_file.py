@@ -16,8 +16,8 @@ from hypothesis import strategies as st
 import mitsuba_diffraction as md
 from mitsuba_diffraction import GratingSpectrum
 from mitsuba_diffraction.energy.table import EnergyTable, Layout
-from mitsuba_diffraction.files import seal
-from mitsuba_diffraction.grating_spectrum import SCALAR_FORMAT_VERSION
+from mitsuba_diffraction.files.writing import seal
+from mitsuba_diffraction.precomputation.grating_spectrum import SCALAR_FORMAT_VERSION
 from mitsuba_diffraction.spectrum.grids import SplineGrid
 from mitsuba_diffraction.spectrum.tables import SliceTable
 

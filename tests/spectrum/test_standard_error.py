@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 
 import mitsuba_diffraction as md
-from mitsuba_diffraction.grating_spectrum import GratingSpectrum
-from mitsuba_diffraction.reference import power_spectrum
+from mitsuba_diffraction.precomputation.grating_spectrum import GratingSpectrum
+from mitsuba_diffraction.scalar_theory.reference import power_spectrum
 from mitsuba_diffraction.spectrum.sample import standard_error
 
 KAPPA, REACH = 34.9, 5.56

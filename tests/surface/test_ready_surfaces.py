@@ -10,7 +10,7 @@ from scipy.special import jv
 
 import mitsuba_diffraction as md
 from mitsuba_diffraction import Recipe
-from mitsuba_diffraction.recipe import source_named
+from mitsuba_diffraction.precomputation.recipe import source_named
 from mitsuba_diffraction.settings import lobe_width
 from mitsuba_diffraction.surface.gratings import (
     COHERENCE_LENGTHS,

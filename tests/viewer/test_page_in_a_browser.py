@@ -11,10 +11,10 @@ import pytest
 
 from mitsuba_diffraction import testing
 from mitsuba_diffraction.bsdf.directions import rotated
-from mitsuba_diffraction.color import delta_E, spectrum_to_XYZ
 from mitsuba_diffraction.evaluation.realtime_shader.diffraction_shader import PUBLISHED_BRIGHTNESS
 from mitsuba_diffraction.evaluation.realtime_shader.evaluate import VARIANTS, shader_for
 from mitsuba_diffraction.evaluation.realtime_shader.quirks import Quirks
+from mitsuba_diffraction.optics.color import delta_E, spectrum_to_XYZ
 from mitsuba_diffraction.render import render
 from mitsuba_diffraction.viewer import page as pages
 from mitsuba_diffraction.viewer.viewed_surface import Surface

@@ -12,8 +12,8 @@ import numpy as np
 import pytest
 
 import mitsuba_diffraction as md
-from mitsuba_diffraction.color import daylight, matching_functions
-from mitsuba_diffraction.recipe import Recipe
+from mitsuba_diffraction.optics.color import daylight, matching_functions
+from mitsuba_diffraction.precomputation.recipe import Recipe
 from mitsuba_diffraction.spectrum.tables import SliceTable
 from mitsuba_diffraction.viewer import page as pages
 from mitsuba_diffraction.viewer.viewed_surface import MAX_LAYERS, Surface

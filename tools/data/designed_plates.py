@@ -19,12 +19,17 @@ from numpy.typing import NDArray
 from volume_integral import extrapolated
 
 import mitsuba_diffraction as md
-from mitsuba_diffraction.files import whole_file
+from mitsuba_diffraction.files.writing import whole_file
 from mitsuba_diffraction.inverse_design import Design
 from mitsuba_diffraction.inverse_design.far_field import lobes_in_bins
 from mitsuba_diffraction.inverse_design.plate import Plate
 from mitsuba_diffraction.inverse_design.target import wanted_fractions
-from mitsuba_diffraction.scalar_theory import efficiency_difference, scalar_orders, tile_powers, transmitted_orders
+from mitsuba_diffraction.scalar_theory.closed_form import (
+    efficiency_difference,
+    scalar_orders,
+    tile_powers,
+    transmitted_orders,
+)
 
 Array = NDArray[np.float64]
 

@@ -5,7 +5,7 @@ Recipes find them by their digest, as in the cache. To be repeated when a recipe
 
 from pathlib import Path
 
-from mitsuba_diffraction.recipe import READY_SPECTRA, Recipe
+from mitsuba_diffraction.precomputation.recipe import READY_SPECTRA, Recipe
 
 RECIPES = Path(__file__).parents[2] / "precompute"
 NAMES = ("xenopeltis", "elaphe", "elaphe_afm")

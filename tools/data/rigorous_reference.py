@@ -21,7 +21,7 @@ from coupled_waves import Efficiencies, converged
 from rich.progress import track
 
 from mitsuba_diffraction.evaluation.validation.coupled_waves import STORED
-from mitsuba_diffraction.files import whole_file
+from mitsuba_diffraction.files.writing import whole_file
 
 DIELECTRIC = 1.5
 TOLERANCE = 3e-3

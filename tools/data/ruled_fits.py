@@ -22,7 +22,7 @@ from mitsuba_diffraction.evaluation.validation.measured_gratings import (
     measured,
     rms_difference,
 )
-from mitsuba_diffraction.files import whole_file
+from mitsuba_diffraction.files.writing import whole_file
 from mitsuba_diffraction.settings import THEORIES
 
 

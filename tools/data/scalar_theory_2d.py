@@ -20,18 +20,16 @@ import numpy as np
 from volume_integral import Orders, extrapolated
 
 import mitsuba_diffraction as md
-from mitsuba_diffraction.files import whole_file
-from mitsuba_diffraction.recipe import Recipe
-from mitsuba_diffraction.scalar_theory import (
-    ERROR_WAVELENGTHS,
-    INDEX,
+from mitsuba_diffraction.files.writing import whole_file
+from mitsuba_diffraction.precomputation.recipe import Recipe
+from mitsuba_diffraction.scalar_theory.closed_form import (
     efficiency_difference,
     incident_direction,
-    scalar_error,
     scalar_orders,
     tile_powers,
     transmitted_orders,
 )
+from mitsuba_diffraction.scalar_theory.validity import ERROR_WAVELENGTHS, INDEX, scalar_error
 
 ROOT = Path(__file__).parents[2]
 STORED = ROOT / "tests" / "data" / "scalar_theory_2d.json"

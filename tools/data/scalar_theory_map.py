@@ -19,14 +19,14 @@ import numpy as np
 from rich.progress import track
 
 from mitsuba_diffraction import gratings, rigorous
-from mitsuba_diffraction.files import whole_file
-from mitsuba_diffraction.scalar_theory import (
-    MAP,
+from mitsuba_diffraction.files.writing import whole_file
+from mitsuba_diffraction.scalar_theory.closed_form import (
     efficiency_difference,
     scalar_orders,
     sinusoid_powers,
     transmitted_orders,
 )
+from mitsuba_diffraction.scalar_theory.validity import MAP
 
 # In wavelengths. Multiples of λ and of λ/n are avoided: at a Rayleigh anomaly the error has a narrow peak.
 PERIODS = (0.97, 1.45, 2.05, 2.7, 3.5, 4.7, 6.7, 9.4, 13.7, 20.3)

@@ -17,12 +17,12 @@ import numpy as np
 from matplotlib.font_manager import findfont
 from PIL import Image, ImageDraw, ImageFont
 
-from mitsuba_diffraction.files import whole_file
-from mitsuba_diffraction.llvm import choose_variant
+from mitsuba_diffraction.files.writing import whole_file
 from mitsuba_diffraction.render import render
 from mitsuba_diffraction.render.denoise import denoised_picture
 from mitsuba_diffraction.render.scene import load_spectral_scene
 from mitsuba_diffraction.render.spectral_image import save_preview
+from mitsuba_diffraction.variants import choose_variant
 
 RECIPES = Path(__file__).parents[2] / "precompute"
 sys.path.insert(0, str(RECIPES.parent / "scenes"))

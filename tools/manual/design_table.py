@@ -19,10 +19,10 @@ import scipy.optimize
 from numpy.typing import NDArray
 
 import mitsuba_diffraction as md
+from mitsuba_diffraction.files.picture_file import read_picture
 from mitsuba_diffraction.inverse_design.plate import Plate
 from mitsuba_diffraction.inverse_design.search import far_field_of
 from mitsuba_diffraction.inverse_design.target import wanted_fractions
-from mitsuba_diffraction.picture_file import read_picture
 
 CAT = Path(__file__).parents[2] / "precompute" / "designed" / "cat.png"
 PLATES: dict[str, Mapping[str, float]] = {

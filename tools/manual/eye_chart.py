@@ -16,8 +16,8 @@ from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
 import mitsuba_diffraction as md
-from mitsuba_diffraction.color import into_gamut, on_screen, plain_view
 from mitsuba_diffraction.evaluation.plots import save_png
+from mitsuba_diffraction.optics.color import into_gamut, on_screen, plain_view
 
 WIDTHS = (2, 3, 4, 6)  # of a bar, in orders
 TEXELS, ANGLE, TEXEL = 64, 17.5, 0.8

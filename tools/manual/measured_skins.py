@@ -15,9 +15,9 @@ from numpy.typing import NDArray
 from PIL import Image
 from scipy import ndimage, signal
 
-from mitsuba_diffraction.files import whole_file
-from mitsuba_diffraction.recipe import Recipe
-from mitsuba_diffraction.scalar_theory import scalar_error
+from mitsuba_diffraction.files.writing import whole_file
+from mitsuba_diffraction.precomputation.recipe import Recipe
+from mitsuba_diffraction.scalar_theory.validity import scalar_error
 from mitsuba_diffraction.surface import prepare
 from mitsuba_diffraction.surface.heightfield import HeightField
 from mitsuba_diffraction.surface.readers import read_height_field

@@ -13,7 +13,7 @@ from pathlib import Path
 from mitsuba_diffraction.bsdf import diffraction_grating
 from mitsuba_diffraction.evaluation.realtime_shader import diffraction_shader
 from mitsuba_diffraction.integrator import diffraction_path
-from mitsuba_diffraction.manual import Parameter
+from mitsuba_diffraction.plugin_parameters import Parameter
 
 PAGE = Path(__file__).parents[2] / "docs" / "plugin.md"
 PLUGINS = {module.__name__.rpartition(".")[2]: module for module in (diffraction_path, diffraction_shader)}

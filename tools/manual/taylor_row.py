@@ -16,10 +16,10 @@ import numpy as np
 from PIL import Image, ImageDraw, ImageFont
 
 from mitsuba_diffraction.bsdf.theory import errors_shown
-from mitsuba_diffraction.llvm import choose_variant
-from mitsuba_diffraction.outputs import png_text
+from mitsuba_diffraction.files.outputs import png_text
 from mitsuba_diffraction.render import render
 from mitsuba_diffraction.render.spectral_image import save_preview
+from mitsuba_diffraction.variants import choose_variant
 
 import mitsuba as mi  # isort: skip  (after LLVM has been chosen)
 

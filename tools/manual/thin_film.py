@@ -22,9 +22,9 @@ from matplotlib.collections import QuadMesh
 from numpy.typing import NDArray
 from scipy.special import jv
 
+from mitsuba_diffraction.bsdf.testing import evaluate_pdf
 from mitsuba_diffraction.evaluation.plots import figure, save_png
 from mitsuba_diffraction.settings import lobe_width
-from mitsuba_diffraction.testing import evaluate_pdf
 
 Array = NDArray[np.float64]
 

@@ -14,10 +14,10 @@ import numpy as np
 from numpy.typing import NDArray
 from PIL import Image
 
-from mitsuba_diffraction.color import XYZ_to_linear_sRGB, auto_exposure, into_gamut, on_screen
 from mitsuba_diffraction.evaluation.comparison.pictures import Pictures
 from mitsuba_diffraction.evaluation.plots import figure, save_png
-from mitsuba_diffraction.llvm import choose_variant
+from mitsuba_diffraction.optics.color import XYZ_to_linear_sRGB, auto_exposure, into_gamut, on_screen
+from mitsuba_diffraction.variants import choose_variant
 
 import mitsuba as mi  # isort: skip  (after LLVM has been chosen)
 

@@ -10,8 +10,8 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from mitsuba_diffraction.evaluation.benchmark.cases import scan
-from mitsuba_diffraction.grating_spectrum import GratingSpectrum
-from mitsuba_diffraction.recipe import Recipe
+from mitsuba_diffraction.precomputation.grating_spectrum import GratingSpectrum
+from mitsuba_diffraction.precomputation.recipe import Recipe
 from mitsuba_diffraction.settings import SUN_COHERENCE_LENGTH, ScalarSettings
 from mitsuba_diffraction.surface.heightfield import HeightField
 

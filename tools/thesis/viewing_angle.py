@@ -21,8 +21,8 @@ from mitsuba_diffraction import testing
 from mitsuba_diffraction.errors import RequestError
 from mitsuba_diffraction.evaluation.realtime_shader.evaluate import relative_radiance
 from mitsuba_diffraction.evaluation.realtime_shader.quirks import Quirks
-from mitsuba_diffraction.grating_spectrum import GratingSpectrum
-from mitsuba_diffraction.llvm import is_supported
+from mitsuba_diffraction.precomputation.grating_spectrum import GratingSpectrum
+from mitsuba_diffraction.variants import is_supported
 
 import mitsuba as mi  # isort: skip  (after LLVM has been chosen)
 

@@ -8,12 +8,12 @@ import numpy as np
 import scipy.special
 from numpy.typing import NDArray
 
-from ...color import daylight, delta_E, spectrum_to_XYZ
-from ...grating_spectrum import GratingSpectrum
-from ...reference import power_spectrum
+from ...bsdf.testing import direction
+from ...optics.color import daylight, delta_E, spectrum_to_XYZ
+from ...precomputation.grating_spectrum import GratingSpectrum
+from ...scalar_theory.reference import power_spectrum
 from ...spectrum.grids import OrderGrid
 from ...surface.heightfield import HeightField
-from ...testing import direction
 from ..record import Record
 from .cases import Case
 

@@ -5,10 +5,10 @@ from __future__ import annotations
 import warnings
 from dataclasses import dataclass
 
-from ...files import examples_folder
-from ...grating_spectrum import GratingSpectrum
-from ...precomputation import precompute
-from ...recipe import Recipe
+from ...files.writing import examples_folder
+from ...precomputation.grating_spectrum import GratingSpectrum
+from ...precomputation.recipe import Recipe
+from ...precomputation.spectra import precompute
 from ...settings import SUN_COHERENCE_LENGTH, ScalarSettings, Settings
 from ...spectrum.sample import effective_coherence_length
 from ...surface import gratings

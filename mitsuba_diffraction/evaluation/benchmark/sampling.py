@@ -11,7 +11,7 @@ import mitsuba as mi
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from ... import testing
+from ...bsdf import testing
 from ...progress import Progress, silent
 from ...settings import VISIBLE
 from .cases import Case

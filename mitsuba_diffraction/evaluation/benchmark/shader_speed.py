@@ -9,8 +9,8 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from ...geometry import k_g
-from ...testing import vectors
+from ...bsdf.testing import vectors
+from ...optics.geometry import k_g
 from ..realtime_shader.evaluate import shader_for
 from ..realtime_shader.quirks import Quirks
 from ..realtime_shader.shader import Shader

@@ -11,8 +11,8 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
+from ...bsdf.testing import interaction, vectors
 from ...settings import VISIBLE
-from ...testing import interaction, vectors
 
 Name = TypeVar("Name", bound=Hashable)
 

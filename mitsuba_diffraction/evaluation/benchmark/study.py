@@ -12,9 +12,9 @@ import mitsuba as mi
 import numpy as np
 from rich.table import Table
 
-from ...files import whole_file
-from ...grating_spectrum import GratingSpectrum
-from ...outputs import METADATA
+from ...files.outputs import METADATA
+from ...files.writing import whole_file
+from ...precomputation.grating_spectrum import GratingSpectrum
 from ...progress import Progress, silent, table
 from ...settings import VISIBLE, ScalarSettings
 from ...spectrum.tables import SliceTable

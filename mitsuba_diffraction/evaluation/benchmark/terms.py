@@ -18,9 +18,9 @@ import numpy as np
 import scipy.fft
 from numpy.typing import NDArray
 
-from ...grating_spectrum import GratingSpectrum
+from ...precomputation.grating_spectrum import GratingSpectrum
 from ...progress import Progress, silent, table
-from ...reference import order_powers
+from ...scalar_theory.reference import order_powers
 from ...settings import ORIGINS, SERIES, VISIBLE
 from ...spectrum.grids import OrderGrid
 from ...spectrum.tables import AmplitudeTable, SliceTable, series_function, series_weights

@@ -7,9 +7,9 @@ from typing import Annotated
 
 import typer
 
-from ... import outputs
 from ...cli.arguments import HeightRange, Overwrite, PixelSize, Variant, check_suffix
 from ...errors import RequestError
+from ...files import outputs
 from ...progress import progress_bar, show
 from ...surface.readers import read_height_field
 
@@ -31,7 +31,7 @@ def benchmark(
     """Measure error and speed of the tables, relative to Mitsuba's roughconductor."""
     import mitsuba as mi
 
-    from ...llvm import choose_variant
+    from ...variants import choose_variant
     from ..benchmark.cases import bundled_cases, scan_case
     from ..benchmark.sampling import measure
     from ..benchmark.study import TOLERANCES, benchmark_tables, run_benchmark, save_speed_plot

@@ -11,10 +11,10 @@ import typer
 
 from ...cli.arguments import Define, Overwrite, Variant, check_suffix, scene_parameters
 from ...errors import RequestError
-from ...files import examples_folder, whole_file
-from ...outputs import check_outputs, free_name, save_json
+from ...files.outputs import check_outputs, free_name, save_json
+from ...files.writing import examples_folder, whole_file
+from ...precomputation.recipe import Recipe
 from ...progress import progress_bar, say, show, tell
-from ...recipe import Recipe
 
 _PICTURES = {"-path.exr": "path_traced", "-published.exr": "published", "-corrected.exr": "corrected"}
 """Suffix → picture."""
@@ -56,8 +56,8 @@ def compare(
 
     import mitsuba as mi
 
-    from ...llvm import choose_variant
     from ...render.parsed_scene import files_of_scene
+    from ...variants import choose_variant
     from ..comparison import compare as run
     from ..comparison import summary
     from ..comparison.pictures import supported_lights

@@ -8,9 +8,9 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from ... import outputs
 from ...cli.arguments import Define, Overwrite, Variant, check_suffix, parse_numbers, scene_parameters
 from ...errors import RequestError
+from ...files import outputs
 from ...progress import progress_bar, show, table, tell
 from ...settings import ORIGINS
 from ..report import cells
@@ -44,8 +44,8 @@ def convergence(
     """
     import mitsuba as mi
 
-    from ...llvm import choose_variant
     from ...render.parsed_scene import files_of_scene
+    from ...variants import choose_variant
     from ..comparison import convergence as study
     from ..comparison import series
 

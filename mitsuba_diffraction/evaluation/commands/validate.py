@@ -8,7 +8,6 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from ... import outputs
 from ...cli.arguments import (
     Overwrite,
     Variant,
@@ -18,11 +17,12 @@ from ...cli.arguments import (
     takes_scan,
 )
 from ...errors import RequestError
+from ...files import outputs
+from ...precomputation.recipe import source_named
 from ...progress import progress_bar, show, tell
-from ...recipe import source_named
 
 if TYPE_CHECKING:
-    from ...recipe import Recipe
+    from ...precomputation.recipe import Recipe
 
 
 @takes_scan
@@ -39,8 +39,8 @@ def validate(
     """Check the BSDF against closed forms and rigorous results, or check one surface; fail if a bound is exceeded."""
     import mitsuba as mi
 
-    from ...grating_spectrum import GratingSpectrum
-    from ...llvm import choose_variant
+    from ...precomputation.grating_spectrum import GratingSpectrum
+    from ...variants import choose_variant
     from .. import report
     from ..validation.checks import checks, surface_checks
 

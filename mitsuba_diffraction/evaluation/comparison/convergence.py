@@ -15,8 +15,8 @@ from dataclasses import dataclass
 import numpy as np
 
 from ...errors import RequestError
-from ...files import whole_file
-from ...outputs import METADATA
+from ...files.outputs import METADATA
+from ...files.writing import whole_file
 from ...progress import Progress, no_progress
 from ...settings import MIN_TOLERANCE
 from .difference import as_shown, difference, noise, time_of_error, white_luminance

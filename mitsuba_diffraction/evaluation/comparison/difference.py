@@ -7,8 +7,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from ...color import XYZ_to_linear_sRGB, auto_exposure, delta_E, into_gamut
 from ...errors import RequestError
+from ...optics.color import XYZ_to_linear_sRGB, auto_exposure, delta_E, into_gamut
 
 
 @dataclass(frozen=True, eq=False)

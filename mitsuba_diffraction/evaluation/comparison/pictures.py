@@ -15,8 +15,8 @@ import mitsuba as mi
 import numpy as np
 from numpy.typing import NDArray
 
-from ...color import spectrum_to_XYZ
 from ...errors import RequestError
+from ...optics.color import spectrum_to_XYZ
 from ...progress import Progress, part, silent
 from ...render import SpectralImage
 from ...render.film import check_memory, collect, equal_ranges, pass_seed, rotated_sampler, sampler_of, trace_pass

@@ -21,9 +21,9 @@ from numpy.typing import NDArray
 
 from ...bsdf.base import gratings_in
 from ...bsdf.theory import errors_shown
-from ...color import XYZ_to_linear_sRGB, delta_E, into_gamut, on_screen, spectrum_to_XYZ
 from ...errors import RequestError
-from ...grating_spectrum import GratingSpectrum
+from ...optics.color import XYZ_to_linear_sRGB, delta_E, into_gamut, on_screen, spectrum_to_XYZ
+from ...precomputation.grating_spectrum import GratingSpectrum
 from ...progress import Progress, no_progress
 from ...render import SpectralImage
 from ...render.film import pass_seed, trace_pass

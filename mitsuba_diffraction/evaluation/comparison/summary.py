@@ -10,9 +10,9 @@ import numpy as np
 from numpy.typing import NDArray
 from rich.table import Table
 
-from ...color import XYZ_to_linear_sRGB, into_gamut, on_screen
-from ...files import whole_file
-from ...outputs import METADATA
+from ...files.outputs import METADATA
+from ...files.writing import whole_file
+from ...optics.color import XYZ_to_linear_sRGB, into_gamut, on_screen
 from ...progress import table
 from .. import report
 from ..realtime_shader.diffraction_shader import PUBLISHED_BRIGHTNESS

@@ -8,10 +8,10 @@ import mitsuba as mi
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from ...bsdf.testing import array, vectors
 from ...errors import RequestError
-from ...llvm import is_supported
 from ...surface.heightfield import HeightField
-from ...testing import array, vectors
+from ...variants import is_supported
 from .flss import FLSS
 from .gem import GEM
 from .nmm import NMM

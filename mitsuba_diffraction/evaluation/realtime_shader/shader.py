@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from ...bsdf.device_tables import larger, opaque
-from ...geometry import k_g
+from ...optics.geometry import k_g
 from ...settings import SUN_COHERENCE_LENGTH, lobe_width
 from ...surface.heightfield import HeightField
 from .quirks import Quirks
@@ -40,7 +40,7 @@ class Gain:
 
         C = F(ω_i·h)/F(1) · (1 + ω_i·ω_o)²/((cos θ_i + cos θ_o)² cos θ_o),
 
-    which is K cos θ_i of the BRDF (`geometry.py`), and G = min(1, 2(n·h)(n·ω_o)/(ω_o·h), 2(n·h)(n·ω_i)/(ω_o·h))
+    which is K cos θ_i of the BRDF (`optics/geometry.py`), and G = min(1, 2(n·h)(n·ω_o)/(ω_o·h), 2(n·h)(n·ω_i)/(ω_o·h))
     (Torrance and Sparrow 1967).
 
     Attributes:

@@ -13,7 +13,7 @@ from ...bsdf.base import gratings_in, is_grating, parts
 from ...bsdf.directions import rotated
 from ...bsdf.layers import Layers
 from ...errors import RequestError
-from ...recipe import Recipe
+from ...precomputation.recipe import Recipe
 from ...rigorous.rigorous_spectrum import RigorousSpectrum
 from .shader import Shader, SpectralWeights
 

@@ -11,7 +11,7 @@ from numpy.typing import ArrayLike, NDArray
 from scipy.optimize import lsq_linear
 
 from ...bsdf.device_tables import PacketTable
-from ...color import daylight, matching_functions
+from ...optics.color import daylight, matching_functions
 from ...settings import VISIBLE
 from .quirks import Quirks
 

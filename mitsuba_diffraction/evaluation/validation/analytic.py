@@ -11,10 +11,10 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.special import jv
 
+from ...bsdf.testing import direction, towards
 from ...settings import lobe_width
 from ...surface import gratings
 from ...surface.heightfield import HeightField
-from ...testing import direction, towards
 from ..record import Check, Record
 from .conservation import parseval
 from .lobes import brdf, density, grating, k_g_between, order_powers_of_bsdf, orders_above, spectrum_of

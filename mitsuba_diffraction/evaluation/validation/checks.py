@@ -4,8 +4,8 @@ from __future__ import annotations
 
 from collections.abc import Callable
 
-from ...grating_spectrum import GratingSpectrum
-from ...scalar_theory import scalar_error
+from ...precomputation.grating_spectrum import GratingSpectrum
+from ...scalar_theory.validity import scalar_error
 from ...surface.heightfield import HeightField
 from ..benchmark.accuracy import against_reference
 from ..record import GROUPS, Check, Record

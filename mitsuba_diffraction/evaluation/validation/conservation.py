@@ -9,8 +9,8 @@ import mitsuba as mi
 import numpy as np
 from numpy.typing import NDArray
 
-from ... import testing
-from ...grating_spectrum import GratingSpectrum
+from ...bsdf import testing
+from ...precomputation.grating_spectrum import GratingSpectrum
 from ...surface import gratings
 from ...surface.heightfield import HeightField
 from ..record import Check, Record

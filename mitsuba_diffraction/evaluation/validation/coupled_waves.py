@@ -21,18 +21,12 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from ...geometry import Orders
-from ...scalar_theory import (
-    efficiency_difference,
-    error_map,
-    expected_error,
-    profile_powers,
-    scalar_orders,
-    sinusoid_powers,
-)
+from ...bsdf.testing import direction
+from ...optics.geometry import Orders
+from ...scalar_theory.closed_form import efficiency_difference, profile_powers, scalar_orders, sinusoid_powers
+from ...scalar_theory.validity import error_map, expected_error
 from ...surface import gratings
 from ...surface.heightfield import HeightField
-from ...testing import direction
 from ..record import Check, Record
 from .lobes import grating, lobe_powers, spectrum_of
 
@@ -241,7 +235,7 @@ CHECKS = (
         "rigorous",
         "BSDF's lobes against R K G E η_m",
         lambda: formula(case for case in cases() if case.angle <= 40),
-        "scalar_theory.py, float64",
+        "closed form, float64",
         slow=True,
     ),
     *(check for profile in SOLVED_PROFILES for check in _of_profile(profile)),

@@ -12,10 +12,10 @@ import mitsuba as mi
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from ... import testing
-from ...geometry import k_g
-from ...grating_spectrum import GratingSpectrum
-from ...precomputation import precompute
+from ...bsdf import testing
+from ...optics.geometry import k_g
+from ...precomputation.grating_spectrum import GratingSpectrum
+from ...precomputation.spectra import precompute
 from ...spectrum.grids import OrderGrid
 from ...surface.heightfield import HeightField
 

@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ...rigorous.solver import efficiencies
-from ...scalar_theory import profile_powers, scalar_orders
+from ...scalar_theory.closed_form import profile_powers, scalar_orders
 from ...settings import THEORIES
 from ...surface.gratings import right_angled
 from ..record import Check, Record

@@ -24,10 +24,10 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.special import gammaln, ndtr
 
-from ...grating_spectrum import GratingSpectrum
+from ...bsdf.testing import direction, towards
+from ...precomputation.grating_spectrum import GratingSpectrum
 from ...settings import lobe_width
 from ...surface.heightfield import HeightField
-from ...testing import direction, towards
 from ..record import Check, Record
 from .lobes import brdf, density, grating, spectrum_of
 

@@ -12,9 +12,9 @@ import functools
 import numpy as np
 from numpy.typing import NDArray
 
-from ...geometry import fresnel
+from ...optics.geometry import fresnel
 from ...rigorous.solver import efficiencies
-from ...scalar_theory import profile_powers, transmitted_orders
+from ...scalar_theory.closed_form import profile_powers, transmitted_orders
 from ...settings import THEORIES
 from ...surface.gratings import blazed, right_angled
 from ...surface.heightfield import HeightField

@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ...errors import RequestError, is_number
-from ...files import refuse_special
+from ...files.writing import refuse_special
 from ...settings import Settings
 from ..heightfield import HeightField
 from . import gwyddion, images, instruments, interferometers, text, workarounds

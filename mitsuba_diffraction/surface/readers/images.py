@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from PIL import Image, UnidentifiedImageError
 
 from ...errors import RequestError
-from ...outputs import MARK
+from ...files.outputs import MARK
 from .scan import DAMAGED, MAX_ARRAY_BYTES, Scan
 
 

@@ -1,4 +1,4 @@
-// XYZ to the screen, as color.py of the package: into the gamut, exposure, roll-off, transfer function of sRGB.
+// XYZ to the screen, as optics/color.py of the package: into the gamut, exposure, roll-off, transfer function of sRGB.
 uniform highp sampler2D uMean;
 uniform float uExposure;
 uniform vec3 uBackground;  // encoded

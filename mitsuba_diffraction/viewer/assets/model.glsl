@@ -1,5 +1,5 @@
 // f = T_i T_o R K G S(q; kappa)/lambda^2 + (1 - R_i)(1 - R_o) base/pi, in 1/sr: bsdf/orders.py, bsdf/continuum.py,
-// bsdf/directions.py, bsdf/coat.py and geometry.py of the package, for reflected light. E is one.
+// bsdf/directions.py, bsdf/coat.py and optics/geometry.py of the package, for reflected light. E is one.
 // KIND, MATERIAL, CUBIC and HAS_BASE are constants of the program (spectrum.js), since some renderers execute both
 // branches of a condition.
 // Directions are unit vectors along the pattern's axes, z the normal, both away from the surface; outside of a coat, which

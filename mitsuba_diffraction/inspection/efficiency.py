@@ -1,0 +1,346 @@
+"""The efficiencies of the orders of a grating over angles and wavelengths, by either theory, as arrays and plots."""
+
+from __future__ import annotations
+
+import csv
+import os
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from .. import rigorous
+from ..errors import RequestError, is_number
+from ..files.outputs import MARK, METADATA
+from ..files.writing import whole_file
+from ..optics.geometry import Orders
+from ..optics.materials import RefractiveIndex, index_of, refractive_index
+from ..progress import Progress, silent
+from ..rigorous.coordinate_transformation import curve_of, is_profile
+from ..rigorous.solver import sheet_orders
+from ..scalar_theory.closed_form import (
+    incident_direction,
+    profile_powers,
+    scalar_orders,
+    tile_powers,
+    transmitted_orders,
+)
+from ..settings import THEORIES, TRANSMISSIONS
+from ..surface.heightfield import HeightField
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
+Array = NDArray[np.float64]
+
+POLARISATIONS = ("s", "p")
+_MAX_ORDERS = 1000  # in scalar theory, which evaluates all pairs of orders for E
+_MAX_ROWS, _MAX_COLUMNS = 24, 8  # of a printed table
+_MAX_LINES, _MAX_MAPS = 7, 6  # of a plot
+
+
+@dataclass(frozen=True, eq=False)
+class OrderEfficiencies:
+    """The fraction of the incident power in each order of a grating.
+
+    Attributes:
+        values: (order, angle, wavelength, polarisation), s- before p-polarised incident light; 0 where an order does
+            not propagate.
+        orders: m, (n,), ascending; for a tile that varies along x and y (m_x, m_y), (n, 2); or names of peaks
+            (`PeakEfficiencies`).
+        angles: of incidence, degrees, (a,).
+        wavelengths: nm, in vacuum, (w,).
+        source: description of the surface, material and theory.
+    """
+
+    values: Array
+    orders: NDArray[np.int64] | NDArray[np.str_]
+    angles: Array
+    wavelengths: Array
+    source: str
+
+    @property
+    def axes(self) -> dict[str, list]:
+        """Return the names of the axes of `values` and the coordinates along them."""
+        return {
+            "order": [tuple(m) if isinstance(m, list) else m for m in self.orders.tolist()],
+            "angle": self.angles.tolist(),
+            "wavelength": self.wavelengths.tolist(),
+            "polarisation": list(POLARISATIONS),
+        }
+
+    @property
+    def unpolarised(self) -> Array:
+        """Return the mean of both polarisations, (order, angle, wavelength)."""
+        return self.values.mean(axis=-1)
+
+    def order(self, *m: int | str) -> Array:
+        """Return the efficiencies of one order, (angle, wavelength, polarisation).
+
+        Raises:
+            ValueError: if it propagates nowhere, or is one number for a tile that varies along x and y.
+        """
+        orders = self.axes["order"]
+        wanted = m[0] if len(m) == 1 else m
+        if wanted not in orders:
+            raise RequestError(f"order: got {wanted!r}, wanted one from {orders[0]} to {orders[-1]} that propagates")
+        return self.values[orders.index(wanted)]
+
+    def __str__(self) -> str:
+        """Return a table for unpolarised light: a row for each angle and wavelength, a column for each strong order."""
+        kept = np.sort(self._strongest(_MAX_COLUMNS))
+        names = [_name(self.axes["order"][index]) for index in kept]
+        width = max(8, *(len(name) + 2 for name in names))
+        rows = [
+            [f"{angle:g}°", f"{wavelength:g} nm", *(f"{100 * e:.3f}" for e in (*of_all[kept], of_all.sum()))]
+            for angle, of_angle in zip(self.angles, np.moveaxis(self.unpolarised, 0, -1), strict=True)
+            for wavelength, of_all in zip(self.wavelengths, of_angle, strict=True)
+        ]
+        lines = [
+            "".join(f"{cell:>{width}}" for cell in row) for row in [["angle", "λ", *names, "sum"], *rows[:_MAX_ROWS]]
+        ]
+        if len(rows) > _MAX_ROWS:
+            lines.append(f"… {len(rows)} rows")
+        if len(self.orders) > _MAX_COLUMNS:
+            lines.append(f"the {_MAX_COLUMNS} strongest of {len(self.orders)} orders; the sum is of all")
+        return "\n".join([f"{self.source}; unpolarised, % of the incident light", *lines])
+
+    __repr__ = __str__
+
+    def _strongest(self, count: int) -> NDArray[np.int64]:
+        """Return the indices of the orders of the largest efficiencies, the strongest first, (count,) or fewer."""
+        return np.argsort(-self.unpolarised.max(axis=(1, 2)), kind="stable")[:count]
+
+    def save_csv(self, path: str | os.PathLike[str]) -> None:
+        """Write a row for each order, angle and wavelength.
+
+        Raises:
+            FileNotFoundError: if the folder does not exist.
+        """
+        with whole_file(path) as temporary, open(temporary, "w", newline="", encoding="utf-8") as stream:
+            rows = csv.writer(stream)
+            names = ["order"] if self.orders.ndim == 1 else ["order_x", "order_y"]
+            rows.writerow([*names, "angle_deg", "wavelength_nm", *POLARISATIONS, "unpolarised"])
+            for order, a, w in np.ndindex(self.values.shape[:3]):
+                pair = self.values[order, a, w]
+                numbers = self.angles[a], self.wavelengths[w], *pair, pair.mean()
+                rows.writerow([*np.atleast_1d(self.orders[order]), *(f"{number:.9g}" for number in numbers)])
+            stream.write(f"# {MARK}\n")
+
+    def plot(self, path: str | os.PathLike[str] | None = None) -> Figure:
+        """Plot the strongest orders; lines over the wavelength or the angle, or if both vary, a map for each order.
+
+        Returns the figure, and writes it as PNG, PDF or SVG if a path is given.
+        """
+        from matplotlib.figure import Figure
+
+        figure = Figure(figsize=(9, 5.2), dpi=120, layout="constrained")
+        (self._plot_maps if min(len(self.angles), len(self.wavelengths)) > 1 else self._plot_lines)(figure)
+        figure.suptitle(self.source, fontsize=10)
+        if path is not None:
+            with whole_file(path) as temporary:
+                figure.savefig(temporary, metadata=METADATA)
+        return figure
+
+    def _plot_lines(self, figure: Figure) -> None:
+        over_wavelengths = len(self.angles) == 1
+        x = self.wavelengths if over_wavelengths else self.angles
+        values = self.values[:, 0] if over_wavelengths else self.values[:, :, 0]
+        axes = figure.add_subplot()
+        for number, index in enumerate(self._strongest(_MAX_LINES)):
+            own = {"color": f"C{number}", "marker": "." if len(x) < 30 else None}
+            axes.plot(x, values[index].mean(axis=-1), **own, label=f"order {_name(self.axes['order'][index])}")
+            axes.plot(x, values[index, :, 0], "--", color=own["color"], lw=0.8)
+            axes.plot(x, values[index, :, 1], ":", color=own["color"], lw=1)
+        axes.plot(x, values.mean(axis=-1).sum(axis=0), color="0.6", label="all orders")
+        axes.plot([], [], "k--", lw=0.8, label="s-polarised")
+        axes.plot([], [], "k:", lw=1, label="p-polarised")
+        axes.set(xlabel=_WAVELENGTH if over_wavelengths else _ANGLE, ylabel="efficiency", ylim=(0, None))
+        fixed = f"{self.angles[0]:g}° incidence" if over_wavelengths else f"{self.wavelengths[0]:g} nm"
+        axes.set_title(f"{fixed}; solid: unpolarised", fontsize=9)
+        axes.legend(fontsize=8, loc="center left", bbox_to_anchor=(1, 0.5))
+
+    def _plot_maps(self, figure: Figure) -> None:
+        from matplotlib.colors import PowerNorm
+
+        kept = self._strongest(_MAX_MAPS)
+        columns = min(3, len(kept))
+        grid = np.ravel(figure.subplots(-(-len(kept) // columns), columns, sharex=True, sharey=True, squeeze=False))
+        scale = PowerNorm(0.5, 0, self.unpolarised[kept].max() or 1.0)  # shows weak orders, too
+        for axes, index in zip(grid, kept, strict=False):
+            of_order = self.unpolarised[index]
+            shown = axes.pcolormesh(self.wavelengths, self.angles, of_order, norm=scale, shading="nearest")
+            axes.set_title(f"order {_name(self.axes['order'][index])}", fontsize=9)
+        for axes in grid[len(kept) :]:
+            axes.set_axis_off()
+        figure.supxlabel(_WAVELENGTH, fontsize=10)
+        figure.supylabel(_ANGLE, fontsize=10)
+        figure.colorbar(shown, ax=grid.tolist(), label="efficiency, unpolarised")
+
+
+_WAVELENGTH, _ANGLE = "wavelength (nm)", "angle of incidence (°)"
+
+
+def _name(order: int | str | tuple[int, int]) -> str:
+    return f"{order:+d}" if isinstance(order, int) and order else str(order).replace(" ", "")
+
+
+def efficiencies(
+    height_field: HeightField,
+    angles: ArrayLike,
+    wavelengths: ArrayLike,
+    *,
+    theory: str = "scalar",
+    material: str | None = None,
+    int_ior: complex | str | None = None,
+    transmission: str = "none",
+    azimuth: float = 0.0,
+    progress: Progress = silent,
+) -> OrderEfficiencies:
+    """Compute the efficiencies of the reflected or transmitted orders of a grating in air.
+
+    Light is incident from above at the angle θ_i, from −x. An order at θ_m, positive towards −x, in a medium of index
+    n_o has
+
+        sin θ_i + n_o sin θ_m = m λ/T    (azimuth 0).
+
+    Scalar theory: the efficiencies are the limit of the BSDF for narrow lobes, R K G E η_m(κ_m) or K_t G_t (1 − F) E
+    η_m(κ_m), in float64 without tables (`scalar_theory`). Rigorous theory: they follow from Maxwell's equations
+    (`rigorous.efficiencies`).
+
+    Args:
+        height_field: one period of a periodic surface; rigorous theory needs a profile, h(x).
+        angles: of incidence, degrees, one or (a,), above −90 and below 90.
+        wavelengths: nm, in vacuum, one or (w,).
+        theory: "scalar" or "rigorous".
+        material: a conductor by Mitsuba's name, "Al", or a file; or "none", the perfect mirror R = 1, in scalar theory.
+        int_ior: or an index of refraction, n + ik, the name of a medium with dispersion, "BK7", or a file
+            (`materials.index_of`); 1.5 if neither is given, as in a scene.
+        transmission: "none": reflected orders; "interface": orders transmitted into the dielectric; "sheet": orders
+            transmitted by a film with a flat lower face, n_o = 1, in rigorous theory with all internal reflections.
+        azimuth: of the plane of incidence, degrees from the x axis; 90: along the grooves (conical incidence).
+        progress: called with (steps done, steps in all).
+
+    Raises:
+        ValueError: if an argument is out of range; in scalar theory, if more than 1000 orders propagate; in rigorous
+            theory, as `rigorous.efficiencies`.
+
+    Warns:
+        UserWarning: as `rigorous.efficiencies`.
+    """
+    if not isinstance(height_field, HeightField):
+        raise RequestError(f"height_field: got {type(height_field).__name__}, wanted a HeightField")
+    angles = checked_numbers("angles", angles, "degrees above −90 and below 90", -90.0, 90.0)
+    wavelengths = checked_numbers("wavelengths", wavelengths, "nm from 10 to 100000 (100 µm)", 9.999, 100_000.001)
+    if theory not in THEORIES:
+        raise RequestError(f"theory: got {theory!r}, wanted one of {', '.join(THEORIES)}")
+    if not is_number(azimuth) or not np.isfinite(azimuth):
+        raise RequestError(f"azimuth: got {azimuth!r}, wanted degrees")
+    int_ior = 1.5 if material is None and int_ior is None else int_ior
+    if transmission not in TRANSMISSIONS:
+        raise RequestError(f"transmission: got {transmission!r}, wanted one of {', '.join(TRANSMISSIONS)}")
+    medium = None if int_ior is None else index_of("int_ior", int_ior)
+    if transmission != "none" and (medium is None or medium.absorbs):
+        absorbing = f"material {material!r}" if material is not None else f"int_ior {int_ior}"
+        raise RequestError(f"transmission: got {transmission!r} with {absorbing}, wanted a dielectric: int_ior, real")
+    if profile := is_profile(height_field):
+        height_field = HeightField(height_field.heights[:1], height_field.pixel_size, height_field.source)
+    # The largest |q| is (n_i + n_o)/λ.
+    shortest = wavelengths.min() * 1e-3 * (1.0 if transmission == "none" else 2 / (1 + max(_largest(medium), 1)))
+    solve = (_scalar if theory == "scalar" else _rigorous)(height_field, azimuth, shortest, transmission)
+    found: dict[tuple[int, ...], Array] = {}
+    for step, (a, w) in enumerate(np.ndindex(len(angles), len(wavelengths)), 1):
+        wavelength = float(wavelengths[w]) * 1e-3
+        index = index_at(wavelength, material, int_ior, theory)
+        orders = solve(float(angles[a]), wavelength, index)
+        for m, *pair in zip(orders.m, orders.s, orders.p, strict=True):
+            of_order = found.setdefault(tuple(np.atleast_1d(m).tolist()), np.zeros((len(angles), len(wavelengths), 2)))
+            of_order[a, w] = pair
+        progress(step, len(angles) * len(wavelengths))
+    all_orders = sorted(found)
+    return OrderEfficiencies(
+        np.stack([found[m] for m in all_orders]),
+        np.array(all_orders)[:, 0] if profile else np.array(all_orders),
+        angles,
+        wavelengths,
+        description(height_field.source, material, int_ior, azimuth, theory, transmission),
+    )
+
+
+def _largest(medium: RefractiveIndex | None) -> float:
+    return 1.0 if medium is None else float(medium.values.real.max())
+
+
+def description(
+    source: str,
+    material: str | None,
+    int_ior: complex | str | None,
+    azimuth: float,
+    theory: str = "scalar",
+    transmission: str = "none",
+) -> str:
+    """Return the description of a surface, material and theory, from arguments of `efficiencies`."""
+    what = material if material is not None else f"n = {int_ior if isinstance(int_ior, str) else f'{int_ior:g}'}"
+    plane = f", plane of incidence at {azimuth:g}°" if azimuth else ""
+    transmitted = {"none": "", "interface": ", transmitted orders inside", "sheet": ", transmitted by a sheet"}[
+        transmission
+    ]
+    return f"{source}; {what}, {theory} theory{transmitted}{plane}"
+
+
+def index_at(wavelength: float, material: str | None, int_ior: complex | str | None, theory: str = "scalar") -> complex:
+    """Return n + ik at a wavelength in µm; in scalar theory infinite for material "none", the perfect mirror."""
+    if (theory, material, int_ior) == ("scalar", "none", None):
+        return complex("inf")
+    return refractive_index(wavelength, int_ior=int_ior, material=material, known=True)
+
+
+_Solve = Callable[[float, float, complex], Orders]
+"""(angle in degrees, wavelength in µm, index) → efficiencies."""
+
+
+def _scalar(height_field: HeightField, azimuth: float, shortest: float, transmission: str) -> _Solve:
+    x, y = height_field.tile_size
+    profile = height_field.shape[0] == 1
+    if (count := 2 * x / shortest if profile else np.pi * x * y / shortest**2) > _MAX_ORDERS:
+        raise RequestError(
+            f"height field: got about {count:.0f} orders of a tile of {x:.4g} × {y:.4g} µm at {1e3 * shortest:g} nm, "
+            f"wanted at most {_MAX_ORDERS}: one period of a grating"
+        )
+    powers = profile_powers(height_field) if profile else tile_powers(height_field, shortest)
+    period = x if profile else (x, y)
+
+    def solve(angle: float, wavelength: float, index: complex) -> Orders:
+        if transmission == "none":
+            return scalar_orders(powers, period, wavelength, angle, index, azimuth)
+        is_sheet = transmission == "sheet"
+        return transmitted_orders(powers, period, wavelength, angle, index.real, azimuth, sheet=is_sheet)
+
+    return solve
+
+
+def _rigorous(height_field: HeightField, azimuth: float, shortest: float, transmission: str) -> _Solve:
+    def solve(angle: float, wavelength: float, index: complex) -> Orders:
+        direction = incident_direction(angle, azimuth)
+        found = rigorous.efficiencies(height_field, direction, wavelength, int_ior=index)
+        if transmission != "sheet":
+            return found.reflection if transmission == "none" else found.transmission
+        k_0 = height_field.tile_size[0] / wavelength
+        return sheet_orders(curve_of(height_field), direction, k_0, index.real, found.harmonics)
+
+    return solve
+
+
+def checked_numbers(name: str, values: ArrayLike, wanted: str, low: float, high: float) -> Array:
+    """Return one number or several, all above `low` and below `high`, as (n,)."""
+    try:
+        array = np.atleast_1d(np.asarray(values, np.float64))
+    except (TypeError, ValueError):
+        raise RequestError(f"{name}: got {values!r}, wanted {wanted}") from None
+    if array.ndim != 1 or not array.size:
+        raise RequestError(f"{name}: got an array of shape {array.shape}, wanted one number or several")
+    if not (inside := (low < array) & (array < high)).all():
+        raise RequestError(f"{name}: got {array[~inside][0]:g}, wanted {wanted}")
+    return array

@@ -1,0 +1,54 @@
+"""Registration of the plugins with Mitsuba, for every variant, now and after each mi.set_variant.
+
+Mitsuba 3.10 and later discover this module through the entry point group `mitsuba` and reload it on each change of
+variant; importing `mitsuba_diffraction` has the same effect in all versions.
+"""
+
+from __future__ import annotations
+
+import functools
+import importlib
+
+import drjit as dr
+import mitsuba as mi
+
+from ..variants import is_supported, llvm_problem
+from .wrapped_functions import wrap_functions
+
+# Name, registration function of Mitsuba, and the module whose `define` makes the class for the current variant.
+PLUGINS = (
+    ("diffraction_grating", "register_bsdf", "bsdf.diffraction_grating"),
+    ("diffraction_path", "register_integrator", "integrator.diffraction_path"),
+    ("diffraction_shader", "register_integrator", "evaluation.realtime_shader.diffraction_shader"),
+)
+
+
+def register_plugins(variant: str) -> None:
+    """Register the plugins for `variant`, or stand-ins that raise the reason why they cannot work."""
+    for name, function, module in PLUGINS:
+        define = importlib.import_module(f"mitsuba_diffraction.{module}").define
+        reason = None
+        if not is_supported(variant):
+            lacks = "vectorised kernels" if "spectral" in variant else "the wavelength of light"
+            reason = (
+                f"{name} needs {lacks}, which the variant {variant} does not have: use llvm_ad_spectral, "
+                "cuda_ad_spectral or their polarised forms"
+            )
+        elif variant.startswith("llvm"):
+            reason = llvm_problem()
+        getattr(mi, function)(name, functools.partial(_refuse, reason) if reason else define())
+
+
+def _refuse(reason: str, props: mi.Properties) -> mi.Object:
+    raise RuntimeError(reason)
+
+
+# A reload must not do this twice.
+if not getattr(mi, "_mitsuba_diffraction_registered", False):
+    wrap_functions([name for name, *_ in PLUGINS])
+    mi._mitsuba_diffraction_registered = True
+    # With one thread, on a machine of one core, Mitsuba 3.9.1 hangs when it reads or writes an EXR picture.
+    if dr.thread_count() < 2:
+        dr.set_thread_count(2)
+if mi.variant() is not None:
+    register_plugins(mi.variant())

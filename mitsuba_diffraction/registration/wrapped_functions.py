@@ -1,0 +1,99 @@
+"""The functions of Mitsuba that the package wraps: `load_dict`, `load_file`, `load_string` and `render`.
+
+A scene that is loaded covers the light of its gratings or is refused in one line, and no garbage is collected while a
+picture is traced.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import functools
+import gc
+from collections.abc import Callable, Collection, Iterator
+
+import mitsuba as mi
+
+from ..bsdf.base import living
+from ..bsdf.light import cover_light
+from ..bsdf.parameters import hand_over
+from ..errors import Bug, RequestError, root_cause
+
+
+def wrap_functions(plugins: Collection[str]) -> None:
+    """Replace the functions of Mitsuba; `plugins` are the names whose errors are reported in one line."""
+    for name in ("load_dict", "load_file", "load_string"):
+        setattr(mi, name, _with_short_errors(getattr(mi, name), plugins))
+    mi.render = _with_light_covered(mi.render)
+
+
+def _with_short_errors(load: Callable[..., mi.Object], plugins: Collection[str]) -> Callable[..., mi.Object]:
+    """Return a loader that accepts a GratingSpectrum in a dict, and reports errors of the plugins in one line.
+
+    The gratings of a scene are made to cover its light.
+    """
+
+    @functools.wraps(load)
+    def loader(scene: dict | str, *args: object, **kwargs: object) -> mi.Object:
+        try:
+            return _with_light(load(hand_over(scene), *args, **kwargs))
+        except RequestError as error:
+            line = str(error)
+        except RuntimeError as error:
+            if not any(f'plugin of type "{name}"' in str(error) for name in plugins):
+                raise
+            try:
+                line = root_cause(error)
+            except Bug:
+                raise error from None  # with its traceback
+        raise RuntimeError(line)
+
+    return loader
+
+
+def _with_light(loaded: mi.Object) -> mi.Object:
+    """Return a scene whose gratings cover its light; if they cannot, only this frame has referred to it."""
+    if isinstance(loaded, mi.Scene):
+        cover_light(loaded)
+    return loaded
+
+
+_count = 0  # of gratings at the last picture
+
+
+@contextlib.contextmanager
+def _garbage_withheld() -> Iterator[None]:
+    """Collect garbage before a picture is traced, if there are more gratings than at the last one, but not inside.
+
+    Dr.Jit calls all gratings in the kernels of all scenes, and where Python frees a BSDF while Dr.Jit traces, the
+    process dies (Mitsuba 3.9.1, any BSDF). Python's collector, which runs because a grating is Python code, frees
+    scenes that stand in reference cycles of the user.
+    """
+    global _count
+    was_enabled = gc.isenabled()
+    if was_enabled and len(living) > _count:
+        gc.collect()
+    _count = len(living)
+    gc.disable()
+    try:
+        yield
+    finally:
+        if was_enabled:
+            gc.enable()
+
+
+def _with_light_covered(render: Callable[..., mi.TensorXf]) -> Callable[..., mi.TensorXf]:
+    """Return `mi.render`, for sensors that are not in the scene, and lights that changed since it was loaded.
+
+    Garbage is not collected while it traces.
+    """
+
+    @functools.wraps(render)
+    def renderer(
+        scene: mi.Scene, params: object = None, sensor: mi.Sensor | int = 0, *args: object, **kwargs: object
+    ) -> mi.TensorXf:
+        if isinstance(scene, mi.Scene):
+            cover_light(scene, sensor)
+        with _garbage_withheld():
+            return render(scene, params, sensor, *args, **kwargs)
+
+    return renderer

@@ -1,0 +1,312 @@
+"""The range of scalar theory: the deviation of its efficiencies from rigorous ones.
+
+A stored map quantifies it for sinusoids, over period/λ and depth/λ, by the solver of `rigorous`
+(`tools/data/scalar_theory_map.py`). Profiles to which rigorous theory applies are solved instead.
+"""
+
+from __future__ import annotations
+
+import functools
+import json
+from collections.abc import Sequence
+from dataclasses import asdict, dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.interpolate import RegularGridInterpolator
+
+from ..errors import RequestError
+from ..rigorous.coordinate_transformation import curve_of, is_profile
+from ..rigorous.rigorous_spectrum import MAX_PERIOD_IN_WAVELENGTHS
+from ..rigorous.solver import converge
+from ..settings import VISIBLE
+from ..surface.heightfield import HeightField
+from ..surface.periods import height_spectrum
+from .closed_form import efficiency_difference, profile_powers, scalar_orders, transmitted_orders
+
+Array = NDArray[np.float64]
+
+MAP = Path(__file__).parents[1] / "data" / "scalar_error.json"
+
+# Conditions under which the error of a surface is reported; the map is the same for ±20°.
+INDEX = 1.5
+ERROR_ANGLES = (0.0, 20.0, -20.0)  # of incidence, degrees
+ERROR_WAVELENGTHS = (0.45, 0.55, 0.65)  # µm, of visible light
+_PARTS = (1 / 6, 1 / 2, 5 / 6)  # of another range of wavelengths: the middles of its thirds
+_MIN_POWER = 1e-9  # of a wave, as a fraction of all
+_WAVES_PER_OCTAVE = 16  # of period, into which the waves of a surface are sorted
+
+MAX_TRUSTED_ERROR = 0.1  # above which a surface is considered outside the range of scalar theory
+# R.m.s. factor between the estimated error, from the map, and the solved error of 48 profiles; docs/validation.md.
+ESTIMATE_FACTOR = 1.4
+_MAX_SOLVER_ERROR = 1e-2
+
+
+def equivalent_depth(rms_height: float) -> float:
+    """Return the peak-to-valley depth of the sinusoid of equal r.m.s. height, 2√2 times that (any unit)."""
+    return 2 * np.sqrt(2) * rms_height
+
+
+@functools.cache
+def error_map(material: str = "dielectric") -> tuple[Array, Array, Array, Array]:
+    """Return the error of scalar theory for sinusoids in unpolarised light (`tools/data/scalar_theory_map.py`).
+
+    Args:
+        material: "dielectric", n = 1.5, or "Al", aluminium at 550 nm; "transmitted" and "transmitted from below": the
+            transmission of the dielectric, with directions in air.
+
+    Returns:
+        period/λ (n,), depth/λ (k,), directions (a, 2) in degrees, and the error, (n, k, a). Directions are the angle of
+        incidence and the azimuth of its plane, 0 if perpendicular to the grooves.
+    """
+    content = json.loads(MAP.read_text(encoding="utf-8"))
+    if material not in content["error"]:
+        raise RequestError(f"material: got {material!r}, wanted one of {', '.join(content['error'])}")
+    periods, depths, directions = (np.array(content[name], float) for name in ("periods", "depths", "directions"))
+    errors = np.reshape(content["error"][material], (len(directions), len(depths), len(periods)))
+    return periods, depths, directions, errors.transpose(2, 1, 0)
+
+
+@functools.cache
+def _interpolated(material: str, largest_angle: float, mean: bool) -> RegularGridInterpolator:
+    periods, depths, directions, errors = error_map(material)
+    errors = errors[..., directions[:, 0] <= largest_angle]
+    error = errors.mean(axis=2) if mean else errors.max(axis=2)
+    return RegularGridInterpolator((np.log(periods), np.log(depths)), np.log(np.maximum(error, 1e-6)))
+
+
+def expected_error(
+    period: float,
+    depth: float,
+    wavelength: float,
+    *,
+    material: str = "dielectric",
+    largest_angle: float = 20.0,
+    mean: bool = False,
+) -> float:
+    """Return the expected error of scalar theory for a surface at incidence up to some angle.
+
+    The largest of the stored errors at 0°, 20°, 40° and 60° up to `largest_angle`, including conical incidence at 40°
+    and 60°, interpolated linearly in the logarithms. The stored errors were computed for sinusoids. Other surfaces are
+    represented by their main period and their `equivalent_depth`; edges increase the error.
+
+    Args:
+        period: µm.
+        depth: peak to valley, µm.
+        wavelength: µm.
+        material: see `error_map`.
+        largest_angle: degrees.
+        mean: of these errors instead of the largest.
+
+    Returns:
+        Σ|Δη_m| relative to the reflected, or transmitted, power. Above the largest stored period (20 λ) and below the
+        smallest depth (λ/20), the value at the boundary, an upper bound. NaN for periods below λ or depths above 2 λ,
+        which are not stored and outside the range of scalar theory.
+
+    Raises:
+        ValueError: unless period and wavelength are positive and the depth is not negative, or for another material.
+    """
+    for name, value in (("period", period), ("wavelength", wavelength)):
+        if not (np.isfinite(value) and value > 0):
+            raise RequestError(f"{name}: got {value!r}, wanted a positive number in µm")
+    if not (np.isfinite(depth) and depth >= 0):
+        raise RequestError(f"depth: got {depth!r}, wanted a number in µm, zero or more")
+    if not largest_angle >= 0:
+        raise RequestError(f"largest_angle: got {largest_angle!r}, wanted degrees, zero or more")
+    periods, depths, _, _ = error_map(material)
+    if period < periods[0] * wavelength or depth > depths[-1] * wavelength:
+        return float("nan")
+    point = np.minimum(period / wavelength, periods[-1]), np.maximum(depth / wavelength, depths[0])
+    return float(np.exp(_interpolated(material, float(largest_angle), mean)(np.log(point))).item())
+
+
+@dataclass(frozen=True)
+class ScalarError:
+    """The error of scalar theory for one surface: the mean over `ERROR_ANGLES` and some wavelengths, for n = 1.5.
+
+    Attributes:
+        share: Σ|Δη_m| as a fraction of the reflected power; infinite outside the stored map (depths above 2 λ).
+        transmitted: the same for transmitted light.
+        estimated: whether it is from the stored map, within about `ESTIMATE_FACTOR`, instead of solved for the surface.
+        remedy: the alternative to scalar theory for this surface.
+        wavelengths: of which it is the mean, in air, µm.
+    """
+
+    share: float
+    transmitted: float
+    estimated: bool
+    remedy: str
+    wavelengths: tuple[float, ...]
+
+    @property
+    def bound(self) -> float:
+        """The error above which the surface is outside the range of scalar theory."""
+        return MAX_TRUSTED_ERROR * (ESTIMATE_FACTOR if self.estimated else 1)
+
+    @property
+    def warning(self) -> str:
+        """A sentence if the error exceeds the bound, otherwise ""."""
+        return f"scalar theory: {self}; {self.remedy}" if self.share > self.bound else ""
+
+    def __str__(self) -> str:
+        first, last = (f"{1e3 * wavelength:.0f}" for wavelength in (self.wavelengths[0], self.wavelengths[-1]))
+        light = f"{first} nm" if first == last else f"{first}–{last} nm"
+        if not np.isfinite(self.share):
+            return f"error unknown, the surface is deeper than two wavelengths ({light})"
+        about = "about " if self.estimated else ""
+        reflected, transmitted = (f"{float(f'{100 * error:.2g}'):g}%" for error in (self.share, self.transmitted))
+        conditions = f"mean over {light} and 0–{max(ERROR_ANGLES):g}°, n = {INDEX:g}"
+        return f"errs by {about}{reflected} of the reflected light, {transmitted} of the transmitted ({conditions})"
+
+
+@dataclass(frozen=True)
+class Waves:
+    """The waves in the heights of a surface, from which the error of scalar theory is estimated for any light.
+
+    Attributes:
+        depth: of the sinusoid of equal roughness, µm.
+        periods: µm, (n,).
+        power: the fraction of the variance of each, (n,).
+        width: of a profile along x, to which rigorous theory applies, µm; None of other surfaces.
+        solved: the error of such a profile, solved for one light.
+    """
+
+    depth: float
+    periods: tuple[float, ...]
+    power: tuple[float, ...]
+    width: float | None = None
+    solved: ScalarError | None = None
+
+    @classmethod
+    def of(cls, height_field: HeightField, extent: str) -> Waves:
+        """Determine the waves of a surface; a "sample" is levelled first."""
+        frequencies, power, rms_height = height_spectrum(height_field, extent)
+        kept = power > _MIN_POWER * power.sum()
+        steps = np.rint(_WAVES_PER_OCTAVE * np.log2(1 / np.maximum(frequencies[kept], 1e-12)))
+        found, where = np.unique(steps, return_inverse=True)
+        sums = np.bincount(where, power[kept]) / max(power.sum(), 1e-300)
+        periods = 2 ** (found / _WAVES_PER_OCTAVE)
+        width = height_field.tile_size[0] if extent == "tile" and is_profile(height_field) else None
+        return cls(float(equivalent_depth(rms_height)), tuple(periods.tolist()), tuple(sums.tolist()), width)
+
+    def error(self, light: tuple[float, float] = VISIBLE, index: float = 1.0) -> ScalarError:
+        """Return the error in light of (shortest, longest) wavelengths, nm, in a medium of an index above the surface.
+
+        The map is averaged over the waves, each weighted by its fraction of the variance, at the depth of the sinusoid
+        of equal roughness. Periods outside the map take the value at its boundary.
+        """
+        wavelengths = error_wavelengths(light)
+        if self.solved is not None and self.solved.wavelengths == wavelengths and index == 1:
+            return self.solved
+        inside = [wavelength / index for wavelength in wavelengths]
+        share, transmitted = (self._estimated(name, inside) for name in ("dielectric", "transmitted"))
+        return ScalarError(share, transmitted, True, self._remedy(light[0] * 1e-3 / index), wavelengths)
+
+    def _estimated(self, material: str, wavelengths: Sequence[float]) -> float:
+        """Return the mean error over wavelengths in µm; infinite for too large a depth."""
+        if self.depth == 0:
+            return 0.0
+        nodes, total = error_map()[0], 0.0
+        for wavelength in wavelengths:
+            depth = self.depth / wavelength
+            errors = [expected_error(node, depth, 1.0, material=material, mean=True) for node in nodes]
+            if not np.isfinite(errors).all():
+                return float("inf")
+            of_waves = np.interp(np.log(np.divide(self.periods, wavelength)), np.log(nodes), np.log(errors))
+            total += float(np.exp(of_waves) @ self.power)
+        return total / len(wavelengths)
+
+    def _remedy(self, shortest: float) -> str:
+        max_period = MAX_PERIOD_IN_WAVELENGTHS * shortest
+        if self.width is None:
+            return "no rigorous theory is offered for a surface that varies along y"
+        if self.width > max_period:
+            return f"rigorous theory is offered for tiles of up to {max_period:.2g} µm along x"
+        return "theory=rigorous has it right"
+
+    def as_plain(self) -> dict[str, Any]:
+        """Return the waves as JSON types."""
+        return asdict(self)
+
+    @classmethod
+    def from_plain(cls, content: dict[str, Any]) -> Waves:
+        """Return the waves that `as_plain` wrote."""
+        content = {name: tuple(value) if isinstance(value, list) else value for name, value in content.items()}
+        if (solved := content.pop("solved")) is not None:
+            solved = ScalarError(**{**solved, "wavelengths": tuple(solved["wavelengths"])})
+        return cls(**content, solved=solved)
+
+
+def error_wavelengths(light: tuple[float, float]) -> tuple[float, ...]:
+    """Return the wavelengths in µm at which the error is determined for light of (shortest, longest) ones in nm."""
+    first, last = light
+    if (first, last) == VISIBLE:
+        return ERROR_WAVELENGTHS
+    return tuple(sorted({1e-3 * (first + (last - first) * part) for part in _PARTS}))
+
+
+def scalar_waves(height_field: HeightField, extent: str = "tile", light: tuple[float, float] = VISIBLE) -> Waves:
+    """Determine the waves of a surface, and solve profiles to which rigorous theory applies for the light in nm."""
+    waves, wavelengths = Waves.of(height_field, extent), error_wavelengths(light)
+    if waves.width is None or waves.width > MAX_PERIOD_IN_WAVELENGTHS * light[0] * 1e-3:
+        return waves
+    # Deeper profiles take long to solve, and are far outside the range.
+    if waves.depth > wavelengths[0]:
+        return waves
+    row = tuple(height_field.heights[0].tolist())
+    solved = _solved_error(row, height_field.pixel_size, wavelengths, ERROR_ANGLES) if waves.depth > 0 else (0.0, 0.0)
+    if not np.isfinite(solved[0]):
+        return waves
+    return replace(waves, solved=ScalarError(*solved, False, waves.error(light).remedy, wavelengths))
+
+
+def scalar_error(height_field: HeightField, extent: str = "tile", light: tuple[float, float] = VISIBLE) -> ScalarError:
+    """Determine the error of scalar theory for a surface; a "sample" is levelled first.
+
+    Periodic profiles to which rigorous theory applies are solved. For any other surface it is estimated (`Waves`).
+
+    Args:
+        height_field: the surface.
+        extent: "tile" or "sample".
+        light: (shortest, longest) wavelengths, nm.
+    """
+    return scalar_waves(height_field, extent, light).error(light)
+
+
+@functools.lru_cache(maxsize=64)
+def _solved_error(
+    heights: tuple[float, ...],
+    pixel_size: tuple[float, float],
+    wavelengths: tuple[float, ...],
+    angles: tuple[float, ...],
+) -> tuple[float, float]:
+    """Compute the mean error of reflected and of transmitted light; NaN if the solver does not converge.
+
+    One profile has several spectra, such as those of a study of convergence.
+    """
+    profile = HeightField(np.array([heights]), pixel_size)
+    period, powers, curve = profile.tile_size[0], profile_powers(profile), curve_of(profile)
+    errors = []
+    for wavelength in wavelengths:
+        for angle in angles:
+            omega_i = np.array([-np.sin(np.deg2rad(angle)), 0.0, np.cos(np.deg2rad(angle))])
+            exact = converge(curve, omega_i, period / wavelength, INDEX, _MAX_SOLVER_ERROR)
+            if not exact.error <= _MAX_SOLVER_ERROR:
+                return float("nan"), float("nan")
+            pairs = (
+                (scalar_orders(powers, period, wavelength, angle, INDEX), exact.reflection),
+                (transmitted_orders(powers, period, wavelength, angle, INDEX), exact.transmission),
+            )
+            # Only one of the theories may include an order exactly at the horizon, which has no power.
+            errors.append(
+                [
+                    efficiency_difference(
+                        one.unpolarised[np.isin(one.m, two.m)], two.unpolarised[np.isin(two.m, one.m)]
+                    )
+                    for one, two in pairs
+                ]
+            )
+    reflected, transmitted_ = np.mean(errors, axis=0)
+    return float(reflected), float(transmitted_)

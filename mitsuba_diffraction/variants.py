@@ -1,0 +1,130 @@
+"""The variants of Mitsuba that can render here, and a usable LLVM for those of Dr.Jit's CPU backend.
+
+Dr.Jit loads libLLVM once, when it is imported: the library in ``DRJIT_LIBLLVM_PATH``, or else the newest of the system.
+That may be missing or too old, without an error: with LLVM 15 and 16 the first kernel with ``dr.maximum`` or
+``dr.clip`` aborts the process. :func:`choose_libllvm` therefore selects the library of the wheel
+``karellen-llvm-core`` unless the variable already points to a suitable one; it must run before Dr.Jit is imported.
+"""
+
+from __future__ import annotations
+
+import ctypes
+import os
+import platform
+import warnings
+from importlib import metadata
+from pathlib import Path
+
+from .errors import RequestError
+
+MINIMUM_VERSION = (17, 0, 0)
+"""Oldest LLVM that compiles every kernel: 15 and 16 abort at ``fmaximum``, Dr.Jit itself refuses 14."""
+
+_PATH_VARIABLE = "DRJIT_LIBLLVM_PATH"
+_WHEEL = "karellen-llvm-core"
+# The wheel's libLLVM finds these through symbolic links that are only created at the next start of the interpreter, and
+# never in a read-only environment. Loading them first, in this order, lets it find them by name.
+_RUNTIME_LIBRARIES = ("libunwind.so.1", "libc++abi.so.1", "libc++.so.1")
+
+
+def choose_libllvm() -> None:
+    """Point ``DRJIT_LIBLLVM_PATH`` to the wheel's library unless it names a suitable one. Call before Dr.Jit loads."""
+    given = os.environ.get(_PATH_VARIABLE)
+    if given and _library_version(given) >= MINIMUM_VERSION:
+        return
+    if path := _wheel_library():
+        if given and given != path:
+            message = f"{_PATH_VARIABLE}={given!r} is not an LLVM {MINIMUM_VERSION[0]} or later; using {path!r}"
+            warnings.warn(message, RuntimeWarning, stacklevel=2)
+        os.environ[_PATH_VARIABLE] = path
+
+
+def llvm_problem() -> str | None:
+    """Return None if Dr.Jit has a suitable LLVM, otherwise one line with the problem and its remedy."""
+    import drjit as dr
+
+    version = tuple(dr.detail.llvm_version()) if dr.has_backend(dr.JitBackend.LLVM) else ()
+    if version >= MINIMUM_VERSION:
+        return None
+    found = f"found {'.'.join(map(str, version))}" if version else "none found"
+    advice = f"install LLVM {MINIMUM_VERSION[0]} or later, or set {_PATH_VARIABLE} to its libLLVM"
+    if _wheel_library():
+        advice = "import mitsuba_diffraction before mitsuba and drjit, which load LLVM only once"
+    elif platform.system() == "Linux" and platform.machine() == "x86_64":
+        advice = f"`pip install {_WHEEL}` (without --target, which omits the library), or {advice}"
+    return f"Dr.Jit's CPU backend needs LLVM {MINIMUM_VERSION[0]} or later ({found}): {advice}"
+
+
+def _load(path: str | Path) -> ctypes.CDLL | None:
+    try:
+        return ctypes.CDLL(str(path))
+    except OSError:
+        return None
+
+
+def _library_version(path: str | Path) -> tuple[int, ...]:
+    """Return the version of the libLLVM at ``path``, () if it does not load or is older than LLVM 16."""
+    library = _load(path)
+    if library is None or not hasattr(library, "LLVMGetVersion"):
+        return ()
+    numbers = [ctypes.c_uint() for _ in range(3)]
+    library.LLVMGetVersion(*map(ctypes.byref, numbers))
+    return tuple(number.value for number in numbers)
+
+
+def _wheel_library() -> str | None:
+    """Return the path of the wheel's libLLVM if it loads, or None."""
+    for distribution in metadata.distributions(name=_WHEEL):
+        files = [
+            Path(file.locate()).resolve()
+            for file in distribution.files or ()
+            if file.name.startswith(("libLLVM", *_RUNTIME_LIBRARIES))
+        ]
+        for name in _RUNTIME_LIBRARIES:
+            for file in files:
+                if file.name.startswith(name):
+                    _load(file)
+        for file in files:
+            if file.name.startswith("libLLVM") and _library_version(file) >= MINIMUM_VERSION:
+                return str(file)
+    return None
+
+
+def is_supported(name: str | None) -> bool:
+    """Return whether a variant is spectral and compiles kernels: ``llvm_ad_spectral``, ``cuda_ad_spectral_polarized``.
+
+    Scalar variants would run the plugin's Python code for each sample, a thousand times slower.
+    """
+    parts = (name or "").split("_")
+    return "spectral" in parts and "scalar" not in parts
+
+
+def choose_variant(requested: str | None = None) -> str:
+    """Choose the variant to render with: the requested one, or ``cuda_ad_spectral`` with a GPU, else LLVM's.
+
+    Raises:
+        ValueError: ``requested`` is not a spectral variant, or a scalar one.
+        RuntimeError: the variant cannot run on this machine; the message names what to install.
+    """
+    import drjit as dr
+    import mitsuba as mi
+
+    available = [name for name in mi.variants() if is_supported(name)]
+    has_gpu = dr.has_backend(dr.JitBackend.CUDA)
+    if requested is None:
+        if has_gpu and "cuda_ad_spectral" in available:
+            return "cuda_ad_spectral"
+        if message := llvm_problem():
+            raise RuntimeError(message)
+        return "llvm_ad_spectral"
+
+    if requested not in available:
+        reason = "is unknown"
+        if requested in mi.variants():
+            reason = "is scalar" if "spectral" in requested else "is not spectral"
+        raise RequestError(f"variant {requested!r} {reason}; use one of {', '.join(available)}")
+    if requested.startswith("cuda") and not has_gpu:
+        raise RuntimeError(f"variant {requested!r} needs an NVIDIA GPU with a recent driver, and Dr.Jit found none")
+    if requested.startswith("llvm") and (message := llvm_problem()):
+        raise RuntimeError(f"variant {requested!r} cannot be used: {message}")
+    return requested

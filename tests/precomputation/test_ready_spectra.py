@@ -1,0 +1,45 @@
+"""The spectra that the package brings are those that their recipes give, and scenes take them."""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+import ready_spectra
+
+from mitsuba_diffraction.energy.table import EnergyTable
+from mitsuba_diffraction.precomputation.recipe import READY_SPECTRA, Recipe
+from mitsuba_diffraction.precomputation.spectra import load_spectrum
+from mitsuba_diffraction.render.scene import load_spectral_scene
+
+ROOT = Path(__file__).parents[2]
+
+
+@pytest.mark.parametrize(
+    "name", [pytest.param(name, marks=() if name == "elaphe_afm" else pytest.mark.slow) for name in ready_spectra.NAMES]
+)
+def test_a_spectrum_of_the_package_is_that_of_its_recipe(name, tmp_path):
+    recipe = Recipe.load(ROOT / "precompute" / f"{name}.toml")
+    kept = load_spectrum(READY_SPECTRA / f"{recipe.digest()}.exr", recipe=recipe.digest())
+    recipe.build().save(tmp_path / "built.exr")  # with its table of E
+    built = load_spectrum(tmp_path / "built.exr")
+    assert (kept.source, kept.warning) == (built.source, built.warning)
+    assert kept.error == pytest.approx(built.error, rel=1e-3)
+    q = np.random.default_rng(0).uniform(-1.5, 1.5, (4000, 2))
+    for kappa in (8.0, 15.0, 22.0):
+        found, expected = (spectrum.evaluate(q, kappa) for spectrum in (kept, built))
+        assert np.abs(found - expected).sum() < 1e-4 * expected.sum()
+    assert np.abs(kept.energy.values.astype(int) - built.energy.values).max() <= 1
+
+
+def test_no_other_spectrum_is_in_the_package():
+    digests = {Recipe.load(ROOT / "precompute" / f"{name}.toml").digest() for name in ready_spectra.NAMES}
+    assert {path.stem for path in READY_SPECTRA.iterdir()} == digests
+
+
+@pytest.mark.parametrize("scene", ["elaphe", "xenopeltis"])
+def test_first_pictures_compute_no_spectrum(scene, tmp_path, monkeypatch, llvm):
+    monkeypatch.setenv("MITSUBA_DIFFRACTION_CACHE", str(tmp_path))
+    monkeypatch.setattr(Recipe, "build", lambda *_: pytest.fail("a spectrum was computed"))
+    monkeypatch.setattr(EnergyTable, "of", lambda *_: pytest.fail("a table of E was computed"))
+    load_spectral_scene(ROOT / "scenes" / f"{scene}.xml", width=4, height=4)
+    assert not list(tmp_path.iterdir())
