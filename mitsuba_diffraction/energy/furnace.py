@@ -56,6 +56,7 @@ MAX_MIRROR_BIN_WIDTH = 0.5  # within the lobe of the mirror direction, in σ_q
 MAX_NODE_POINTS = 6  # on each side along x and y, for a node of S wider than half a bin
 MAX_LOBE_PHASE = 0.1  # radians within one σ of the lobe of an order, above which it is evaluated at several points
 LOBE_POINTS = 9
+MIN_SINGLE_CONTRAST = 0.01  # |η − 1| below which v_z of transmitted light cancels too much for single precision
 MIN_COS_ONE_POINT = 0.25  # cos θ_o below which a bin is evaluated at three points
 MAX_PAIRS = 1 << 17  # (direction, component) evaluated at once, so that they fit into the cache
 
@@ -214,10 +215,11 @@ class Furnace:
         A part of (directions, components) has a term for each pair, and indices of shape (directions, 1) and
         (components,).
         """
-        if not self.by_order:
+        index = (branch and self.index) or 1.0
+        if not self.by_order and (not branch or abs(index - 1) >= MIN_SINGLE_CONTRAST):
             # Bins are wide; but an order is above the horizon or not.
             directions, length = directions.astype(np.float32), length.astype(np.float32)
-        s, cos_i, index = directions[:, :2], np.abs(directions[:, 2]), (branch and self.index) or 1.0
+        s, cos_i = directions[:, :2], np.abs(directions[:, 2])
         q = (self.q * (branch or 1)).astype(length.dtype)
         radius = np.zeros_like(q[:, 0]) if self.by_order else (np.sqrt(3) * self.widths).astype(length.dtype)
         middle, mean = s.mean(0), (length.min() + length.max()) / 2
