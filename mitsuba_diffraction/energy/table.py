@@ -39,7 +39,6 @@ from __future__ import annotations
 import base64
 import binascii
 import dataclasses
-import itertools
 import zlib
 from collections.abc import Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
@@ -287,26 +286,23 @@ def _bounds(
     omega, wavelengths = layout.directions(points[used], float(np.mean(layout.frequencies)))
     e = np.ones((len(ratios), sum(len(side.branches[:2]) for side in sides), len(points)))
     if layout.lines:
-        slices = [np.arange(len(omega))]
+        slices = np.array_split(np.arange(len(omega)), SLICES)
     else:
         # R and T of films, and the index, depend on the wavelength; there are few wavelengths.
         slices = [np.flatnonzero(wavelengths == wavelength) for wavelength in np.unique(wavelengths)]
     step = (layout.frequencies[1] - layout.frequencies[0]) / (2 * max(layout.slices - 1, 1))
 
-    def of_slice(ratio: float, slice_: NDArray[np.int64]) -> Real:
+    def of_slice(slice_: NDArray[np.int64]) -> Real:
         bounds = []
         for side in sides:
-            furnace = dataclasses.replace(side, height_scale=ratio).at(wavelengths[slice_[0]], laterals, step)
+            furnace = side.at(wavelengths[slice_[0]], laterals, step)
             length = wavelengths[slice_] * (1.0 if side.side > 0 else furnace.index or 1.0)
-            bounds.append(furnace.bounds(omega[slice_], length))
-        return np.concatenate(bounds)
+            bounds.append(furnace.bounds(omega[slice_], length, ratios))
+        return np.concatenate(bounds, axis=1)
 
-    pairs = list(itertools.product(range(len(ratios)), slices))
     with ThreadPoolExecutor(usable_cores()) as pool:
-        for (k, slice_), bounds in zip(
-            pairs, pool.map(lambda pair: of_slice(ratios[pair[0]], pair[1]), pairs), strict=True
-        ):
-            e[k, :, np.flatnonzero(used)[slice_]] = bounds.T
+        for slice_, bounds in zip(slices, pool.map(of_slice, slices), strict=True):
+            e[..., np.flatnonzero(used)[slice_]] = bounds
     if mirror:
         count = len(np.unique(points[:, 1]))
         mirrored = e.reshape(*e.shape[:2], -1, count, count)[..., ::mirror, ::mirror].swapaxes(-1, -2)
