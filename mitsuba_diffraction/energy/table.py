@@ -218,16 +218,21 @@ class EnergyTable:
         above = Furnace.of(spectrum, max(ratios), stack, laterals[0])
         sides = [above] if stack is None else [above, above.from_below()]
         layout = Layout.of(sides[0], laterals)
-        e = _bounds(layout, sides, ratios, layout.points(0.0), laterals).reshape(len(ratios), -1, *layout.shape)
+        of_nodes = _bounds(layout, sides, ratios, layout.points(0.0), laterals)
+        of_centres = _bounds(layout, sides, ratios, layout.points(0.5), laterals)
         # e varies fast where an order is just above the horizon, and in deep reliefs. Where it is less at the centre of
         # a grid cell than between the corners, the corners are lowered by the difference.
         corners = layout.corners()
-        of_centres = _bounds(layout, sides, ratios, layout.points(0.5), laterals).reshape(e[corners[0]].shape)
-        excess = np.where(of_centres < 1, np.mean([e[corner] for corner in corners], axis=0) - of_centres, 0)
-        lowered = e.copy()
-        for corner in corners:
-            lowered[corner] = np.minimum(lowered[corner], e[corner] - np.maximum(excess, 0))
-        values = np.rint(np.clip(lowered, 0, MAX_E) * (255 / MAX_E)).astype(np.uint8)
+        values = np.empty((*of_nodes.shape[:2], *layout.shape), np.uint8)
+        for channel in np.ndindex(of_nodes.shape[:2]):
+            e = of_nodes[channel].reshape(layout.shape)
+            between = np.mean([e[corner] for corner in corners], axis=0)
+            centre = of_centres[channel].reshape(between.shape)
+            excess = np.maximum(np.where(centre < 1, between - centre, 0), 0)
+            lowered = e.copy()
+            for corner in corners:
+                lowered[corner] = np.minimum(lowered[corner], e[corner] - excess)
+            values[channel] = np.rint(np.clip(lowered, 0, MAX_E) * (255 / MAX_E))
         return cls(layout, values, tuple(ratios))
 
     @property
