@@ -121,7 +121,7 @@ class OrderSampler:
             # With E at the central wavelength.
             omega, wavelengths = self._nodes(self.slices / 2)
             furnace, inside = self._at(furnaces[0], above, wavelengths)
-            bounds = furnace.bounds(self._inside(omega, above, inside), wavelengths / inside)
+            (bounds,) = furnace.bounds(self._inside(omega, above, inside), wavelengths / inside, [scales[0]])
             reflected, transmitted = np.array(powers_of_sides) * bounds
             fraction = (transmitted / np.maximum(reflected + transmitted, 1e-30)).reshape(self.side_bins + 1, -1)
             middles = (np.indices((FRACTION_SIDE_BINS, FRACTION_SIDE_BINS)) + 0.5) * (

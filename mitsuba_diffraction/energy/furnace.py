@@ -28,10 +28,10 @@ light.
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cache
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.polynomial.legendre import leggauss
@@ -57,8 +57,22 @@ MAX_MIRROR_BIN_WIDTH = 0.5  # within the lobe of the mirror direction, in σ_q
 MAX_NODE_POINTS = 6  # on each side along x and y, for a node of S wider than half a bin
 MAX_LOBE_PHASE = 0.1  # radians within one σ of the lobe of an order, above which it is evaluated at several points
 LOBE_POINTS = 9
+MIN_SINGLE_CONTRAST = 0.01  # |η − 1| below which v_z of transmitted light cancels too much for single precision
 MIN_COS_ONE_POINT = 0.25  # cos θ_o below which a bin is evaluated at three points
 MAX_PAIRS = 1 << 17  # (direction, component) evaluated at once, so that they fit into the cache
+
+
+class _Terms(NamedTuple):
+    """Terms of the albedo of components without their powers, n, or one for each pair of (directions, components).
+
+    Indices are of shape (n,) each, or (directions, 1) and (components,).
+    """
+
+    direction: Indices
+    component: Indices
+    factor: Real  # K G Γ
+    cosine: Real  # |ω_i·h|
+    kappa: Real  # for unscaled heights, rad/µm
 
 
 @dataclass(frozen=True, eq=False)
@@ -72,7 +86,7 @@ class Furnace:
         q: (n, 2) cycles/µm, the centres of components.
         widths: (n,) cycles/µm, their standard deviations.
         powers: float32 (n, K), at K equidistant κ from 0 to κ_max of the spectrum, for unscaled heights.
-        height_scale: the factor of the heights.
+        height_scale: the factor of the heights, the largest if there are several.
         lobe_scale: the factor of the widths of lobes of orders.
         stack: the dielectric with its films, if light is transmitted.
         side: 1 if ω is above the surface, −1 if below.
@@ -103,7 +117,7 @@ class Furnace:
 
         Args:
             spectrum: S(q; κ).
-            height_scale: the factor of the heights.
+            height_scale: the factor of the heights, the largest if there are several.
             stack: the dielectric with its films, if light is transmitted.
             lobe_scale: the factor of the widths of lobes of orders.
         """
@@ -161,16 +175,23 @@ class Furnace:
 
         return (bare,)
 
-    def bounds(self, directions: Real, wavelengths: Real) -> Real:
-        """Return e of E (`bounds_of`) for the same arguments as `albedo`.
+    def bounds(self, directions: Real, wavelengths: Real, scales: Sequence[float]) -> Real:
+        """Return e of E (`bounds_of`) for the same directions and wavelengths as `albedo`.
 
         Where the thickness of films varies, e = 1/max(1, R + T) at the worst thickness, for both R and T.
+
+        Args:
+            directions, wavelengths: see `albedo`.
+            scales: factors of the heights, up to `height_scale`.
+
+        Returns:
+            (scales, 1 or 2, n).
         """
-        albedos = self._albedos(directions, wavelengths)
-        if len(albedos) > 1:
-            return 1 / np.maximum(albedos.sum(axis=1).max(axis=0), 1) * np.ones((2, 1))
+        albedos = self._albedos(directions, wavelengths, scales)
+        if albedos.shape[1] > 1:
+            return 1 / np.maximum(albedos.sum(axis=2).max(axis=1), 1)[:, None] * np.ones((2, 1))
         normal = None if self.index is None else float(self._planes[0](np.ones(1))[0][0])
-        return bounds_of(albedos[0], normal)
+        return np.stack([bounds_of(albedo, normal) for albedo in albedos[:, 0]])
 
     def albedo(self, directions: Real, wavelengths: Real) -> Real:
         """Compute a(ω, λ), or R and T of an interface, of films of their mean thickness.
@@ -182,22 +203,25 @@ class Furnace:
         Returns:
             (1, n), or (2, n): R and T.
         """
-        return self._albedos(directions, wavelengths)[len(self._planes) // 2]
+        return self._albedos(directions, wavelengths, [self.height_scale])[0, len(self._planes) // 2]
 
-    def _albedos(self, directions: Real, wavelengths: Real) -> Real:
-        """Return `albedo` of each thickness, (planes, 1 or 2, n)."""
+    def _albedos(self, directions: Real, wavelengths: Real, scales: Sequence[float]) -> Real:
+        """Return `albedo` for each factor of the heights and each thickness, (scales, planes, 1 or 2, n)."""
         planes = self._planes
-        result = np.zeros((len(planes), len(self.branches[:2]), len(directions)))
+        result = np.zeros((len(scales), len(planes), len(self.branches[:2]), len(directions)))
         # Adjacent directions share most of their components.
         for batch in np.array_split(np.arange(len(directions)), 1 + len(directions) * len(self.q) // MAX_PAIRS):
             for branch in self.branches:
-                for direction, _, value, cosine in self._terms(directions[batch], wavelengths[batch], branch):
-                    for of_plane, plane in zip(result, planes, strict=True):
-                        power = value * plane(cosine)[abs(branch)]
-                        if value.ndim == 1:
-                            of_plane[abs(branch), batch] += np.bincount(direction, power, len(batch))
-                        else:
-                            of_plane[abs(branch), batch] += power.sum(-1, np.float64)
+                for term in self._terms(directions[batch], wavelengths[batch], branch):
+                    factors = [term.factor * plane(term.cosine)[abs(branch)] for plane in planes]
+                    for of_scale, scale in zip(result, scales, strict=True):
+                        powers = self._power(term.component, term.kappa, branch, scale)
+                        for of_plane, factor in zip(of_scale, factors, strict=True):
+                            if factor.ndim == 1:
+                                total = np.bincount(term.direction, factor * powers, len(batch))
+                            else:
+                                total = (factor * powers).sum(-1, np.float64)
+                            of_plane[abs(branch), batch] += total
         return result
 
     def terms(self, directions: Real, length: Real, branch: int) -> tuple[Indices, Indices, Real]:
@@ -205,20 +229,18 @@ class Furnace:
 
         Order j diffracts light from ω to k_o,∥ = −ω_∥ − λ q_j, or −ω_∥ + λ q_j in branch −1, in units of n_i.
         """
-        ((i, j, value, cosine),) = self._terms(directions, length, branch)
+        (term,) = self._terms(directions, length, branch)
         planes = self._planes
-        return i, j, value * planes[len(planes) // 2](cosine)[abs(branch)]
+        factor = term.factor * planes[len(planes) // 2](term.cosine)[abs(branch)]
+        return term.direction, term.component, factor * self._power(term.component, term.kappa, branch)
 
-    def _terms(self, directions: Real, length: Real, branch: int) -> list[tuple[Indices, Indices, Real, Real]]:
-        """Return the `terms` without R or T, and |ω_i·h|, in parts of n terms each.
-
-        A part of (directions, components) has a term for each pair, and indices of shape (directions, 1) and
-        (components,).
-        """
-        if not self.by_order:
+    def _terms(self, directions: Real, length: Real, branch: int) -> list[_Terms]:
+        """Return the `terms` without R or T and powers, in parts."""
+        index = (branch and self.index) or 1.0
+        if not self.by_order and (not branch or abs(index - 1) >= MIN_SINGLE_CONTRAST):
             # Bins are wide; but an order is above the horizon or not.
             directions, length = directions.astype(np.float32), length.astype(np.float32)
-        s, cos_i, index = directions[:, :2], np.abs(directions[:, 2]), (branch and self.index) or 1.0
+        s, cos_i = directions[:, :2], np.abs(directions[:, 2])
         q = (self.q * (branch or 1)).astype(length.dtype)
         radius = np.zeros_like(q[:, 0]) if self.by_order else (np.sqrt(3) * self.widths).astype(length.dtype)
         middle, mean = s.mean(0), (length.min() + length.max()) / 2
@@ -245,11 +267,9 @@ class Furnace:
         value, cosine = self._factor(mean_cos_i, cos_o, length, length**2 * (q**2).sum(-1)[j], branch)
         # Reflected light uses κ of the two directions; transmitted light uses κ of the order's exact direction.
         kappa = self._kappa(mean_cos_i if branch else cos_i, cos_o if branch else cos_exit, length, branch)
-        return [(i, j, weight * value * self._power(j, kappa, branch), cosine)]
+        return [_Terms(i, j, weight * value, cosine, kappa)]
 
-    def _bin_terms(
-        self, cos_i: Real, length: Real, bins: Indices, rho: Real, branch: int
-    ) -> list[tuple[Indices, Indices, Real, Real]]:
+    def _bin_terms(self, cos_i: Real, length: Real, bins: Indices, rho: Real, branch: int) -> list[_Terms]:
         """Compute the `_terms` of directions (n,) and `bins` (m,), whose centres have sin θ_o = ρ, (n, m).
 
         Near the horizon a bin has three terms, at points in cos θ_o, as K G varies with that, over the radial extent
@@ -263,40 +283,38 @@ class Furnace:
         i, j = np.nonzero(~far & (rho - radius < 1))
         cos_o, r, _ = _above_horizon(rho, sigma, 1)
         all_i = np.arange(len(cos_i))[:, None]
-        value, cosine = self._at_points(cos_i[:, None], length[:, None], bins, rho, sigma, tangent, cos_o, r, branch)
-        of_far = all_i, bins, value * far, cosine
+        value, *others = self._at_points(cos_i[:, None], length[:, None], rho, sigma, tangent, cos_o, r, branch)
+        of_far = _Terms(all_i, bins, value * far, *others)
         rho, sigma, tangent = (x[i, j] for x in (rho, sigma, tangent))
         cos_o, r, weight = _above_horizon(rho, sigma, 3)
-        value, cosine = self._at_points(cos_i[i], length[i], bins[j], rho, sigma, tangent, cos_o, r, branch)
-        return [of_far, (np.tile(i, 3), np.tile(bins[j], 3), (value * weight).ravel(), cosine.ravel())]
+        value, cosine, kappa = self._at_points(cos_i[i], length[i], rho, sigma, tangent, cos_o, r, branch)
+        near = np.tile(i, 3), np.tile(bins[j], 3), (value * weight).ravel(), cosine.ravel(), kappa.ravel()
+        return [of_far, _Terms(*near)]
 
     def _at_points(
         self,
         cos_i: Real,
         length: Real,
-        bins: Indices,
         rho: Real,
         sigma: Real,
         tangent: Real,
         cos_o: Real,
         r: Real,
         branch: int,
-    ) -> tuple[Real, Real]:
-        """Return the power at points r of bins of width σ about ρ and |λq|² = `tangent`, and |ω_i·h|."""
+    ) -> tuple[Real, Real, Real]:
+        """Return `_factor` and κ at points r of bins of width σ about ρ and |λq|² = `tangent`."""
         index, square = (branch and self.index) or 1.0, np.maximum(1 - cos_i**2, 0)
         # |λq|² along the line from the centre of the hemisphere; the component of ω_∥ along it is at most sin θ_i.
         max_along = 2 * index * np.sqrt(square)
         along = np.clip((index**2 * rho**2 + square - tangent) / np.maximum(rho, 1e-12), -max_along, max_along)
         tangent = np.maximum(square + index**2 * r**2 - r * along, 0) + (index * sigma) ** 2
-        value, cosine = self._factor(cos_i, cos_o, length, tangent, branch)
-        value *= self._power(bins, self._kappa(cos_i, cos_o, length, branch), branch)
-        return value, cosine
+        return *self._factor(cos_i, cos_o, length, tangent, branch), self._kappa(cos_i, cos_o, length, branch)
 
     def _factor(self, cos_i: Real, cos_o: Real, length: Real, tangent: Real, branch: int) -> tuple[Real, Real]:
         """Return K G with the gain, or K_t G_t, at |λq|² = `tangent`, and |ω_i·h|, (..., n); λ is (n,)."""
         if branch:
             index = self.index or 1.0
-            min_v_z = self._min_kappa / max(self.height_scale, 1e-9) * length / (2 * np.pi)
+            min_v_z = self._min_kappa(self.height_scale) / max(self.height_scale, 1e-9) * length / (2 * np.pi)
             k_oz = index * np.asarray(cos_o)
             square = tangent + (cos_i - k_oz) ** 2
             cosine = np.abs(square + 1 - index**2) / (2 * np.sqrt(square))
@@ -321,14 +339,17 @@ class Furnace:
         v_z = branch * (cos_i - (self.index or 1.0) * cos_o) if branch else cos_i + cos_o
         return 2 * np.pi / length * np.maximum(v_z, 0)
 
-    @property
-    def _min_kappa(self) -> float:
+    def _min_kappa(self, scale: float) -> float:
         nominal = 1.0 if self.stack is None else self.stack.nominal**self.side
-        return min_kappa(self.spectrum, nominal, self.height_scale, self.lobe_scale)
+        return min_kappa(self.spectrum, nominal, scale, self.lobe_scale)
 
-    def _power(self, component: Indices, kappa: Real, branch: int) -> Real:
-        """Return the powers of components at κ. For transmitted light below κ₁ see `small_kappa`."""
-        last = self.powers.shape[1] - 1
+    def _power(self, component: Indices, kappa: Real, branch: int, scale: float | None = None) -> Real:
+        """Return the powers of components at κ, for heights times `scale`, by default `height_scale`.
+
+        For transmitted light below κ₁ see `small_kappa`. The terms have K_t with the κ₁ of `height_scale`; it is
+        corrected for that of `scale`.
+        """
+        last, scale = self.powers.shape[1] - 1, self.height_scale if scale is None else scale
         flat, start = self.powers.ravel(), component * (last + 1)
 
         def at(kappa: Real | float) -> Real:
@@ -338,11 +359,15 @@ class Furnace:
             below = flat.take(index)
             return below + (x - interval) * (flat[1:].take(index) - below)
 
-        is_forward, kappa = kappa > 0, kappa * self.height_scale
+        scaled = kappa * scale
         if not branch:
-            return at(kappa)
-        first = self._min_kappa
-        return small_kappa(kappa, first, at(kappa), at(first), at(2 * first)) * is_forward
+            return at(scaled)
+        first = self._min_kappa(scale)
+        power = small_kappa(scaled, first, at(scaled), at(first), at(2 * first)) * (kappa > 0)
+        if scale != self.height_scale:
+            of_terms, of_scale = (self._min_kappa(x) / max(x, 1e-9) for x in (self.height_scale, scale))
+            power = power * (np.maximum(kappa, of_terms) / np.maximum(kappa, of_scale)) ** 2
+        return power
 
 
 def min_kappa(spectrum: PowerSpectrum, index: float, height_scale: float = 1.0, lateral_scale: float = 1.0) -> float:

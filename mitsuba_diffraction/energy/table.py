@@ -39,7 +39,6 @@ from __future__ import annotations
 import base64
 import binascii
 import dataclasses
-import itertools
 import zlib
 from collections.abc import Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
@@ -219,16 +218,21 @@ class EnergyTable:
         above = Furnace.of(spectrum, max(ratios), stack, laterals[0])
         sides = [above] if stack is None else [above, above.from_below()]
         layout = Layout.of(sides[0], laterals)
-        e = _bounds(layout, sides, ratios, layout.points(0.0), laterals).reshape(len(ratios), -1, *layout.shape)
+        of_nodes = _bounds(layout, sides, ratios, layout.points(0.0), laterals)
+        of_centres = _bounds(layout, sides, ratios, layout.points(0.5), laterals)
         # e varies fast where an order is just above the horizon, and in deep reliefs. Where it is less at the centre of
         # a grid cell than between the corners, the corners are lowered by the difference.
         corners = layout.corners()
-        of_centres = _bounds(layout, sides, ratios, layout.points(0.5), laterals).reshape(e[corners[0]].shape)
-        excess = np.where(of_centres < 1, np.mean([e[corner] for corner in corners], axis=0) - of_centres, 0)
-        lowered = e.copy()
-        for corner in corners:
-            lowered[corner] = np.minimum(lowered[corner], e[corner] - np.maximum(excess, 0))
-        values = np.rint(np.clip(lowered, 0, MAX_E) * (255 / MAX_E)).astype(np.uint8)
+        values = np.empty((*of_nodes.shape[:2], *layout.shape), np.uint8)
+        for channel in np.ndindex(of_nodes.shape[:2]):
+            e = of_nodes[channel].reshape(layout.shape)
+            between = np.mean([e[corner] for corner in corners], axis=0)
+            centre = of_centres[channel].reshape(between.shape)
+            excess = np.maximum(np.where(centre < 1, between - centre, 0), 0)
+            lowered = e.copy()
+            for corner in corners:
+                lowered[corner] = np.minimum(lowered[corner], e[corner] - excess)
+            values[channel] = np.rint(np.clip(lowered, 0, MAX_E) * (255 / MAX_E))
         return cls(layout, values, tuple(ratios))
 
     @property
@@ -287,26 +291,23 @@ def _bounds(
     omega, wavelengths = layout.directions(points[used], float(np.mean(layout.frequencies)))
     e = np.ones((len(ratios), sum(len(side.branches[:2]) for side in sides), len(points)))
     if layout.lines:
-        slices = [np.arange(len(omega))]
+        slices = np.array_split(np.arange(len(omega)), SLICES)
     else:
         # R and T of films, and the index, depend on the wavelength; there are few wavelengths.
         slices = [np.flatnonzero(wavelengths == wavelength) for wavelength in np.unique(wavelengths)]
     step = (layout.frequencies[1] - layout.frequencies[0]) / (2 * max(layout.slices - 1, 1))
 
-    def of_slice(ratio: float, slice_: NDArray[np.int64]) -> Real:
+    def of_slice(slice_: NDArray[np.int64]) -> Real:
         bounds = []
         for side in sides:
-            furnace = dataclasses.replace(side, height_scale=ratio).at(wavelengths[slice_[0]], laterals, step)
+            furnace = side.at(wavelengths[slice_[0]], laterals, step)
             length = wavelengths[slice_] * (1.0 if side.side > 0 else furnace.index or 1.0)
-            bounds.append(furnace.bounds(omega[slice_], length))
-        return np.concatenate(bounds)
+            bounds.append(furnace.bounds(omega[slice_], length, ratios))
+        return np.concatenate(bounds, axis=1)
 
-    pairs = list(itertools.product(range(len(ratios)), slices))
     with ThreadPoolExecutor(usable_cores()) as pool:
-        for (k, slice_), bounds in zip(
-            pairs, pool.map(lambda pair: of_slice(ratios[pair[0]], pair[1]), pairs), strict=True
-        ):
-            e[k, :, np.flatnonzero(used)[slice_]] = bounds.T
+        for slice_, bounds in zip(slices, pool.map(of_slice, slices), strict=True):
+            e[..., np.flatnonzero(used)[slice_]] = bounds
     if mirror:
         count = len(np.unique(points[:, 1]))
         mirrored = e.reshape(*e.shape[:2], -1, count, count)[..., ::mirror, ::mirror].swapaxes(-1, -2)

@@ -83,16 +83,17 @@ class OrderGrid(_Rectangle):
         x, y = (m / size for m, size in zip(self.axes(), self.tile_size, strict=True))
         return x, y
 
-    def take(self, powers: NDArray, half: float = 0.5) -> NDArray:
+    def take(self, powers: NDArray, half: float = 0.5, along: tuple[int, ...] = (0, 1)) -> NDArray:
         """Select the kept orders, in the order of `axes`, from the powers of all, (N_y, N_x), as in `scipy.fft.fft2`.
 
-        The Nyquist order of an even N has no sign: both signs get the factor `half`, for amplitudes √½.
+        The Nyquist order of an even N has no sign: both signs get the factor `half`, for amplitudes √½. With one axis
+        in `along`, the orders along that axis are selected.
         """
-        m_x, m_y = self.axes()
-        taken = powers[np.ix_(m_y % powers.shape[0], m_x % powers.shape[1])]
-        for lines, m, count in ((taken, m_y, powers.shape[0]), (taken.T, m_x, powers.shape[1])):
-            lines[2 * np.abs(m) == count] *= half
-        return taken
+        for axis in along:
+            m, count = self.axes()[1 - axis], powers.shape[axis]
+            powers = powers.take(m % count, axis)
+            powers.swapaxes(0, axis)[2 * np.abs(m) == count] *= half
+        return powers
 
     def around(
         self, q: NDArray[np.float64], lobe_width: float, cutoff_sigmas: float

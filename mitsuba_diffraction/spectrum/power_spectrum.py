@@ -27,7 +27,8 @@ class PowerSpectrum:
             and the tolerance is a number.
         pixel_size: (x, y) of the height field, µm.
         height_range: of the height field, µm.
-        error: the measured maximum over κ of ∫|S_approx − S_exact| dq over the frequencies that light can reach.
+        error: the maximum over several measured κ of ∫|S_approx − S_exact| dq over the frequencies that light can
+            reach. Between them it may be larger, for means of few patches by up to two thirds.
         source: origin of the heights.
         source_digest: SHA-256 of the height field.
         truncated_power: the largest fraction of the power, over κ, at weak frequencies that are left out; part of

@@ -17,16 +17,21 @@ from ..surface.heightfield import HeightField
 from .grids import SHIFTS, OrderGrid, SplineGrid, inner, spline
 from .tables import derivative_bound
 
+_BLOCK_SIZE = 1 << 14  # pixels that are evaluated at once; larger temporary arrays would be new pages of memory
+
 
 def phase_wave(heights: NDArray[np.float64], kappa: float) -> NDArray[np.complex64]:
     """Compute e^{iκh} in single precision, of the shape of the heights (µm); κ in rad/µm."""
-    turns = heights * (kappa / (2 * np.pi))
-    turns -= np.rint(turns)  # in double precision
-    phase = turns.astype(np.float32)
-    phase *= np.float32(2 * np.pi)
     wave = np.empty(heights.shape, np.complex64)
-    np.cos(phase, out=wave.real)
-    np.sin(phase, out=wave.imag)
+    rows = max(1, _BLOCK_SIZE // heights.shape[1])
+    for first in range(0, len(heights), rows):
+        block = slice(first, first + rows)
+        turns = heights[block] * (kappa / (2 * np.pi))
+        turns -= np.rint(turns)  # in double precision
+        phase = turns.astype(np.float32)
+        phase *= np.float32(2 * np.pi)
+        np.cos(phase, out=wave[block].real)
+        np.sin(phase, out=wave[block].imag)
     return wave
 
 
@@ -57,17 +62,20 @@ class TilePowers:
 
     def __call__(self, kappa: float) -> NDArray[np.float64]:
         """Compute η_m(κ), (rows, columns); κ in rad/µm."""
-        total = np.zeros(self._heights[0].shape)
+        total = np.zeros(self.grid.shape)
         with ThreadPoolExecutor(usable_cores()) as pool:
             for power in pool.map(partial(self._power, kappa), self._heights):
                 total += power
-        return self.grid.take(total / self.transforms)
+        return total / self.transforms
 
     def _power(self, kappa: float, heights: NDArray[np.float64]) -> NDArray[np.floating]:
-        """Compute |F{e^{iκh}}|² of one tile."""
-        wave = phase_wave(heights, kappa) if self.single else np.exp(1j * kappa * heights)
-        transform = scipy.fft.fft2(wave, norm="forward", overwrite_x=True)
-        return transform.real**2 + transform.imag**2
+        """Compute |F{e^{iκh}}|² of one tile at the orders of the grid."""
+        amplitude = phase_wave(heights, kappa) if self.single else np.exp(1j * kappa * heights)
+        for axis in (1, 0):
+            # Only columns that are kept are transformed along y.
+            amplitude = scipy.fft.fft(amplitude, axis=axis, norm="forward", overwrite_x=True)
+            amplitude = self.grid.take(amplitude, 0.5**0.5, (axis,))
+        return amplitude.real**2 + amplitude.imag**2
 
     def derivative_bound(self, n: int) -> float:
         """Return an upper bound of Σ_m |∂ⁿη_m/∂κⁿ|, µmⁿ."""

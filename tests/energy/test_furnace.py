@@ -1,6 +1,7 @@
 """The furnace against closed forms: reflected orders one by one, and reflection and transmission of an interface."""
 
 import functools
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -165,3 +166,18 @@ def test_light_that_a_bin_diffracts_along_the_normal_has_an_albedo():
     with np.errstate(all="raise", under="ignore"):
         found = furnace.albedo(omega, np.full(len(omega), 0.5))
     assert np.isfinite(found).all()
+
+
+def test_bins_transmit_as_orders_into_a_medium_of_nearly_the_same_index():
+    index, rng = 1.0005, np.random.default_rng(5)
+    of = md.precompute(
+        md.gratings.crossed(2.5, 0.8, samples=48),
+        coherence_length=1e5,
+        wavelengths=(SHORT / index, LONG / index),
+    )
+    furnace = Furnace.of(of, 1.0, Stack(1.0, constant(index)))
+    assert furnace.by_order
+    # Lobes so narrow that none meets the horizon.
+    omega, wavelengths = oblique(rng, 60, 60), rng.uniform(SHORT, LONG, 60) * 1e-3
+    found = replace(furnace, by_order=False).albedo(omega, wavelengths)
+    np.testing.assert_allclose(found, furnace.albedo(omega, wavelengths), rtol=1e-5)
