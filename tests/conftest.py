@@ -16,8 +16,6 @@ from threadpoolctl import threadpool_limits
 
 import mitsuba_diffraction as md  # before Dr.Jit, so that it has an LLVM that works
 from mitsuba_diffraction import cli, progress
-from mitsuba_diffraction.bsdf import shared
-from mitsuba_diffraction.energy.table import EnergyTable
 
 from bsdf_support import use  # isort: skip
 from mitsuba_diffraction.render import passes
@@ -75,30 +73,6 @@ def garbage_between_modules():
     gc.disable()
     yield
     gc.enable()
-
-
-@pytest.fixture(scope="module", autouse=True)
-def tables_of_a_module():
-    """Share the tables of equal spectra among the tests of a module, which build a new BSDF each."""
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(shared, "_shared", {})
-        yield
-
-
-@pytest.fixture(scope="session", autouse=True)
-def results_of_a_session():
-    """Compute E of equal spectra once."""
-    energy_of, energies = EnergyTable.of, {}
-
-    def energy(spectrum, ratios=(1.0,), stack=None, laterals=(1.0, 1.0)):
-        key = spectrum.digest, tuple(ratios), stack, tuple(laterals)
-        if key not in energies:
-            energies[key] = energy_of(spectrum, ratios, stack, laterals)
-        return energies[key]
-
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(EnergyTable, "of", energy)
-        yield
 
 
 @pytest.fixture(scope="session", autouse=True)

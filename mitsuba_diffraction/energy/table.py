@@ -39,8 +39,9 @@ from __future__ import annotations
 import base64
 import binascii
 import dataclasses
+import threading
 import zlib
-from collections.abc import Mapping, Sequence
+from collections.abc import Hashable, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field
 from typing import Any
@@ -61,6 +62,7 @@ MAX_NODE_COMPONENT_PAIRS = 3e7  # evaluations for a table with one ratio
 SLICES, MAX_SLICES = 16, 96  # nodes of 1/λ; more than the minimum where fringes of films are narrow
 MIN_FRACTION = 1e-7  # distance of nodes from whole u and v
 MIN_T = 0.01  # t of nodes at the horizon
+MAX_KEPT = 16  # tables of this process that are kept; at most 6.4 MB each, mostly 0.4 MB
 
 
 @dataclass(frozen=True)
@@ -207,7 +209,9 @@ class EnergyTable:
         stack: Stack | None = None,
         laterals: tuple[float, float] = (1.0, 1.0),
     ) -> EnergyTable:
-        """Compute the table of `spectrum`.
+        """Return the table of `spectrum`: one of the last `MAX_KEPT`, or computed.
+
+        A scene that is loaded again, or a parameter that returns to a value, takes the table that it had.
 
         Args:
             spectrum: S(q; κ); for an interface, of wavelengths in the denser medium.
@@ -215,6 +219,20 @@ class EnergyTable:
             stack: the dielectric with its films, if light is transmitted.
             laterals: bounds of s.
         """
+        key = spectrum.digest, tuple(ratios), stack, laterals
+        with _keeping:
+            kept = _kept.pop(key, None)
+        table = kept or cls._computed(spectrum, ratios, stack, laterals)
+        with _keeping:
+            _kept[key] = table
+            while len(_kept) > MAX_KEPT:
+                _kept.pop(next(iter(_kept)))  # least recently used
+        return table
+
+    @classmethod
+    def _computed(
+        cls, spectrum: PowerSpectrum, ratios: Sequence[float], stack: Stack | None, laterals: tuple[float, float]
+    ) -> EnergyTable:
         above = Furnace.of(spectrum, max(ratios), stack, laterals[0])
         sides = [above] if stack is None else [above, above.from_below()]
         layout = Layout.of(sides[0], laterals)
@@ -273,6 +291,10 @@ class EnergyTable:
         if not 0 < size < 1 << 26 or len(content) != size:
             raise RequestError(f"energy table: got {len(content)} bytes, wanted {size}")
         return cls(layout, np.frombuffer(content, np.uint8).reshape(1, 1, *layout.shape))
+
+
+_keeping = threading.Lock()
+_kept: dict[Hashable, EnergyTable] = {}
 
 
 def _bounds(

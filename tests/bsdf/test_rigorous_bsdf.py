@@ -1,7 +1,6 @@
 """The BSDF of rigorous efficiencies, against its table in float64 and against the solver."""
 
 import dataclasses
-import weakref
 from pathlib import Path
 
 import drjit as dr
@@ -11,7 +10,7 @@ import pytest
 from bsdf_support import check_chi_square, direction, evaluate, interaction, made_up, random_directions, use, vectors
 
 import mitsuba_diffraction as md
-from mitsuba_diffraction.bsdf import shared, testing
+from mitsuba_diffraction.bsdf import testing
 from mitsuba_diffraction.optics.geometry import fresnel, horizon_gain
 from mitsuba_diffraction.rigorous.rigorous_spectrum import RigorousSpectrum
 from mitsuba_diffraction.rigorous.solver import mueller
@@ -56,8 +55,7 @@ def plugin(spectrum, **parameters):
     return mi.load_dict({"type": "diffraction_grating", "spectrum": spectrum, **parameters})
 
 
-def test_instances_of_one_table_share_it(llvm, monkeypatch):
-    monkeypatch.setattr(shared, "_shared", weakref.WeakValueDictionary())
+def test_instances_of_one_table_share_it(llvm):
     one, other = (plugin(made_up(3.0)).layers.grating.theory.scattering for _ in range(2))
     assert one is other
 

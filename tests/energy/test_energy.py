@@ -13,7 +13,7 @@ from bsdf_support import array, floats, plugin, vectors
 from scipy.ndimage import gaussian_filter
 
 import mitsuba_diffraction as md
-from mitsuba_diffraction.bsdf import shared, testing
+from mitsuba_diffraction.bsdf import testing
 from mitsuba_diffraction.energy.furnace import Furnace
 from mitsuba_diffraction.energy.table import MAX_E, EnergyTable
 
@@ -274,6 +274,23 @@ def test_the_table_is_stored_with_the_spectrum(tmp_path, monkeypatch):
     assert bsdf.layers.grating.theory.energy is not None
 
 
+def test_a_surface_that_is_loaded_again_has_the_tables_that_it_had(tmp_path, monkeypatch):
+    of = spectrum("deep blazed")
+    of.save(tmp_path / "s.exr")
+    first, again = (md.GratingSpectrum.load(tmp_path / "s.exr") for _ in range(2))
+    assert first is not again
+    table = EnergyTable.of(first, (0.9,))
+    assert EnergyTable.of(again, (0.9,)) is table
+    assert EnergyTable.of(again, (0.8,)) is not table
+    assert EnergyTable.of(again, (0.9,), laterals=(1.0, 1.1)) is not table
+    # The least recently used is forgotten.
+    monkeypatch.setattr("mitsuba_diffraction.energy.table.MAX_KEPT", 2)
+    older, newer = (EnergyTable.of(again, (ratio,)) for ratio in (0.8, 0.9))
+    EnergyTable.of(again, (0.7,))
+    assert EnergyTable.of(first, (0.9,)) is newer
+    assert EnergyTable.of(first, (0.8,)) is not older
+
+
 @pytest.mark.parametrize(
     "wrong",
     [{"values": "AAAA"}, {"unknown": 1}, {"slices": 1 << 20}, {"frequencies": [1, 0]}, {"period": 0}],
@@ -288,8 +305,7 @@ def test_a_damaged_table_is_refused(wrong):
 
 
 @pytest.mark.slow
-def test_instances_of_one_surface_share_their_tables(tmp_path, monkeypatch):
-    monkeypatch.setattr(shared, "_shared", weakref.WeakValueDictionary())
+def test_instances_of_one_surface_share_their_tables(tmp_path):
     of = spectrum("blazed")
     of.save(tmp_path / "s.exr")
     one, other = (mi.load_dict({"type": "diffraction_grating", "filename": str(tmp_path / "s.exr")}) for _ in range(2))
