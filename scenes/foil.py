@@ -59,7 +59,7 @@ def sheet(count: int) -> tuple[Array, Array, Array]:
 
 
 def shards(rng: np.random.Generator, columns: int) -> tuple[Array, Array]:
-    """Return directions of the grating in degrees and pitches in µm, (rows, columns) each."""
+    """Return directions of the grating in degrees and pitches in µm, (rows, columns) each, from the top."""
     rows = round(columns * HEIGHT / WIDTH)
     sites = rng.random((SHARDS, 2)) * (HEIGHT, WIDTH)
     y, x = (np.arange(n) + 0.5 for n in (rows, columns))
@@ -72,7 +72,7 @@ def make(folder: Path, count: int = 900) -> None:
     """Write foil.ply, `count` quads long, foil_turn.exr and foil_pitch.exr."""
     write_sheets(folder / "foil.ply", [sheet(count)])
     for name, values in zip(("turn", "pitch"), shards(np.random.default_rng(6), 2 * count), strict=True):
-        write_numbers(folder / f"foil_{name}.exr", values)
+        write_numbers(folder / f"foil_{name}.exr", values[::-1])
 
 
 if __name__ == "__main__":

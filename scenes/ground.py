@@ -8,25 +8,15 @@ from __future__ import annotations
 from pathlib import Path
 
 import numpy as np
-from modelling import Array, command, noise, normals_from_slopes, write_colours, write_numbers
-
-STONE = 60.0  # width and height of the texture in the scenes
-WOOD = (64.0, 32.0)
+from modelling import Array, command, noise, write_colours
 
 
-def slopes(height: Array, pixel: float) -> tuple[Array, Array]:
-    """Return ∂h/∂u and ∂h/∂v of a periodic height, cm, on square pixels."""
-    return tuple((np.roll(height, -1, axis) - np.roll(height, 1, axis)) / (2 * pixel) for axis in (1, 0))
-
-
-def stone(rng: np.random.Generator, size: int) -> tuple[Array, Array]:
-    """Return colours and normals of a rough grey slab."""
+def stone(rng: np.random.Generator, size: int) -> Array:
+    """Return colours of a rough grey slab."""
     shape = (size, size)
     cloud, grain = noise(rng, shape, 1.5, 0.3), noise(rng, shape, 0.4)
     shade = 0.45 * (1 + 0.13 * cloud + 0.09 * grain)
-    colour = shade[..., None] * (np.array([1.0, 0.95, 0.88]) + 0.03 * noise(rng, shape, 1.6, 0.2)[..., None])
-    height = 0.02 * noise(rng, shape, 1.9, 0.03) + 0.05 * noise(rng, shape, 2.2, 0.1)
-    return colour, normals_from_slopes(*slopes(height, STONE / size))
+    return shade[..., None] * (np.array([1.0, 0.95, 0.88]) + 0.03 * noise(rng, shape, 1.6, 0.2)[..., None])
 
 
 def wood(rng: np.random.Generator, size: int) -> Array:
@@ -52,10 +42,8 @@ def wood(rng: np.random.Generator, size: int) -> Array:
 
 
 def make(folder: Path, size: int = 2048) -> None:
-    """Write stone.png, stone_normals.exr and wood.png, `size` texels wide."""
-    colour, normals = stone(np.random.default_rng(1), size)
-    write_colours(folder / "stone.png", colour)
-    write_numbers(folder / "stone_normals.exr", normals)
+    """Write stone.png and wood.png, `size` texels wide."""
+    write_colours(folder / "stone.png", stone(np.random.default_rng(1), size))
     write_colours(folder / "wood.png", wood(np.random.default_rng(2), size))
 
 

@@ -79,18 +79,21 @@ def _difference(points: Array, axis: int) -> Array:
 
 
 def write_colours(path: Path, srgb: Array) -> None:
-    """Write a texture of colours (.png): sRGB in [0, 1], (rows, columns, 3); row 0 is at v = 1, as in Mitsuba."""
+    """Write a texture of colours (.png): sRGB in [0, 1], (rows, columns, 3), from the top, v = 1.
+
+    The first row of a file is at v = 0 in Mitsuba.
+    """
     with whole_file(path) as temporary:
         Image.fromarray(np.round(255 * np.clip(srgb, 0, 1)).astype(np.uint8)[::-1]).save(temporary)
 
 
 def write_numbers(path: Path, values: Array) -> None:
-    """Write a texture of numbers (.exr, half): (rows, columns) or (rows, columns, 3); row 0 is at v = 1.
+    """Write a texture of numbers (.exr, half): (rows, columns) or (rows, columns, 3), the first at v = 0.
 
     Eight bits are too few for normals: their steps of half a degree are as wide as the lobes of a grating.
     """
     with whole_file(path) as temporary:
-        mi.Bitmap(np.ascontiguousarray(values[::-1]).astype(np.float16)).write(str(temporary))
+        mi.Bitmap(np.ascontiguousarray(values).astype(np.float16)).write(str(temporary))
 
 
 def normals_from_slopes(slope_u: Array, slope_v: Array) -> Array:

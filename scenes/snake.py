@@ -379,7 +379,7 @@ def make(folder: Path, columns: int = 5120) -> None:
     eyes(folder / "snake_eyes.ply", sweep)
     for name in SKINS:
         texture = scales(folder, name, sweep, columns)
-        write_colours(folder / f"{name}_pigment.png", pigment(name, texture))
+        write_colours(folder / f"{name}_pigment.png", pigment(name, texture)[::-1])
 
 
 def small(folder: Path) -> None:
@@ -391,7 +391,7 @@ def small(folder: Path) -> None:
     for name in SKINS:
         texture = scales(folder, name, sweep, 2560)
         if name == "elaphe":
-            write_colours(folder / "elaphe_pigment.png", pigment(name, texture)[::2, ::2])
+            write_colours(folder / "elaphe_pigment.png", pigment(name, texture)[::-2, ::2])
 
 
 def body(path: Path, along: int, around: int) -> Sweep:

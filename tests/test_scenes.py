@@ -31,6 +31,7 @@ import disc  # noqa: E402
 import foil  # noqa: E402
 import ground  # noqa: E402
 import hologram  # noqa: E402
+import modelling  # noqa: E402
 import snake  # noqa: E402
 
 
@@ -384,6 +385,36 @@ def test_snakes_have_their_colours(scales):
             assert back.mean() < 0.25
 
 
+def test_textures_lie_as_their_arrays_say(tmp_path, llvm):
+    """Numbers from v = 0, colours from the top, as Mitsuba reads their files."""
+    numbers = np.array([[0.1, 0.2], [0.3, 0.4], [0.5, 0.6]])
+    modelling.write_numbers(tmp_path / "numbers.exr", numbers)
+    modelling.write_colours(tmp_path / "colours.png", np.tile(numbers[..., None], 3))
+    for name, rows in (("numbers.exr", [0, 1, 2]), ("colours.png", [2, 1, 0])):
+        file = {"type": "bitmap", "filename": str(tmp_path / name), "raw": True, "filter_type": "nearest"}
+        si = dr.zeros(mi.SurfaceInteraction3f, 3)
+        si.uv = mi.Point2f(0.25, mi.Float([0.5 / 3, 1.5 / 3, 2.5 / 3]))
+        np.testing.assert_allclose(mi.load_dict(file).eval_1(si), numbers[rows, 0], atol=2e-3)
+
+
+@pytest.mark.parametrize("name", sorted(snake.SKINS))
+def test_scales_are_domes(name, llvm):
+    """On both sides of the middle of a scale at the back, normals turn outwards, and those of its rim the most."""
+    texture = {"type": "bitmap", "filename": str(SCENES / f"coil/{name}_normals.exr"), "raw": True}
+    texels = snake.texels(snake.Sweep.along(800), snake.SKINS[name], 1280)
+    middle = (texels.edge < 0.1) & (np.abs(texels.v - 0.5) < 0.2) & (texels.s > 40) & (texels.s < 100)
+    row, column = np.nonzero(middle)
+    assert len(row) > 200
+    si = dr.zeros(mi.SurfaceInteraction3f, len(row))
+    towards = []
+    for of_scale in (-0.8, -0.3, 0.3, 0.8):
+        v = texels.v[row, 0] + of_scale / snake.SKINS[name].rows
+        si.uv = mi.Point2f((column + 0.5) / 1280, v)
+        towards.append(np.mean(2 * np.array(mi.load_dict(texture).eval_3(si))[1] - 1))
+    assert towards[0] < towards[1] < -0.01
+    assert 0.01 < towards[2] < towards[3]
+
+
 @pytest.mark.slow
 def test_models_are_the_same_each_time(tmp_path):
     files = []
@@ -454,7 +485,7 @@ def test_foil_is_embossed_with_shards():
 
 
 def test_the_ground_texture_tiles():
-    colour, _ = ground.stone(np.random.default_rng(1), 128)
+    colour = ground.stone(np.random.default_rng(1), 128)
     inside = np.abs(np.diff(colour, axis=1)).mean()
     assert np.abs(colour[:, 0] - colour[:, -1]).mean() < 2 * inside
 
