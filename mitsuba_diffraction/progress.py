@@ -29,7 +29,7 @@ Progress = Callable[[int, int], None]  # called with the part done and the total
 out = Console(highlight=False, soft_wrap=True)
 err = Console(stderr=True, highlight=False, soft_wrap=True)
 
-_MIN_REPORTED_SECONDS = 2.0  # of work before a log or a notebook shows progress
+MIN_REPORTED_SECONDS = 2.0  # of work before a log or a notebook shows progress
 _MIN_REPORTED_DURATION = 10.0  # s, of a command
 _UNITS_OF_BYTES = ("GB", 1e9), ("MB", 1e6), ("kB", 1e3)
 _lock = threading.Lock()
@@ -138,7 +138,7 @@ def _count(done: float, total: int, unit: str) -> str:
 
 
 def log_lines(
-    label: str, unit: str = "", begin: str = "", seconds: float = 30.0, first: float = _MIN_REPORTED_SECONDS
+    label: str, unit: str = "", begin: str = "", seconds: float = 30.0, first: float = MIN_REPORTED_SECONDS
 ) -> Callable[..., None]:
     """Report progress without a terminal: the message `begin`, a line after `first` seconds, then every `seconds`."""
     if begin:
@@ -190,7 +190,7 @@ def progress_bar(label: str, unit: str = "", begin: str = "") -> Iterator[Callab
             counted.set()
             show_line(*numbers)
 
-        waiting = threading.Timer(_MIN_REPORTED_SECONDS, _say_stage, (label, len(_stages), counted))
+        waiting = threading.Timer(MIN_REPORTED_SECONDS, _say_stage, (label, len(_stages), counted))
         waiting.daemon = True
         if not begin:
             waiting.start()
@@ -250,7 +250,7 @@ def _notebook_line(label: str, unit: str) -> Iterator[Callable[..., None]]:
         line = {"text/plain": f"{label}: {_count(done, total, _after(unit, depth))}, {seconds:.0f} s"}
         if handle is not None:
             handle.update(line, raw=True)
-        elif seconds >= _MIN_REPORTED_SECONDS:
+        elif seconds >= MIN_REPORTED_SECONDS:
             handle = display(line, raw=True, display_id=True)
 
     yield show

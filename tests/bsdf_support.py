@@ -68,8 +68,8 @@ def coarse_glass(transmission):
     )
     with pytest.MonkeyPatch.context() as patch, warnings.catch_warnings():
         warnings.simplefilter("ignore")
-        patch.setattr("mitsuba_diffraction.rigorous.build_table._SOLVED_STEPS_TRANSMISSION", ((3, 4, 3),))
-        patch.setattr("mitsuba_diffraction.rigorous.build_table._CHECK_COUNT", 40)
+        patch.setattr("mitsuba_diffraction.rigorous.build_table.SOLVED_STEPS_TRANSMISSION", ((3, 4, 3),))
+        patch.setattr("mitsuba_diffraction.rigorous.build_table.CHECK_COUNT", 40)
         return build_rigorous(md.gratings.blazed(0.3, 0.05, samples=64), settings)
 
 

@@ -24,6 +24,7 @@ from mitsuba_diffraction.render import passes
 # CI draws the same examples each time, so that a failure is of the change; slow tests draw others.
 settings.register_profile("tests", deadline=None, max_examples=30, derandomize="CI" in os.environ)
 settings.register_profile("slow", deadline=None, max_examples=200)
+settings.register_profile("quick", deadline=None, max_examples=5)
 
 MEASURED = Path(__file__).parents[1] / "precompute" / "measured"
 _HEIGHT_RANGE = {"elaphe": 0.375, "xenopeltis": 0.819}
@@ -39,8 +40,9 @@ def pytest_addoption(parser):
 
 
 def pytest_configure(config):
-    """Draw fewer examples where slow tests are left out."""
-    settings.load_profile("tests" if "not slow" in config.option.markexpr else "slow")
+    """Draw fewer examples where slow tests are left out, and few where only quick ones run."""
+    chosen = config.option.markexpr
+    settings.load_profile("quick" if chosen == "quick" else "tests" if "not slow" in chosen else "slow")
 
 
 @pytest.hookimpl(tryfirst=True)  # before -m selects
@@ -61,7 +63,8 @@ def pytest_collection_modifyitems(items):
     tests = set()
     for item in items:
         takes_long = "llvm" in item.fixturenames or _TAKES_LONG & vars(item.module).keys()
-        if not (takes_long or item.get_closest_marker("slow") or item.function in tests):
+        marked = item.get_closest_marker("slow") or item.get_closest_marker("not_quick")
+        if not (takes_long or marked or item.function in tests):
             tests.add(item.function)
             item.add_marker(pytest.mark.quick)
 
@@ -140,7 +143,7 @@ def command(monkeypatch, capfd):
         monkeypatch.setattr(sys, "argv", [cli.NAME, *arguments])
         # On a slow machine a command says how far it is.
         monkeypatch.setattr(progress, "log_lines", lambda *label: lambda *done: None)
-        monkeypatch.setattr(progress, "_say_stage", lambda *label: None)
+        monkeypatch.setattr(progress, "MIN_REPORTED_SECONDS", 1e6)
         # Warnings are shown, as they are to a person, and what shows them is put back afterwards.
         with warnings.catch_warnings():
             warnings.simplefilter("default")

@@ -39,7 +39,7 @@ def test_what_the_commands_name_exists(command):
         named |= set(re.findall(r"(?:scenes|precompute|docs|notebooks)/[\w./]+\.\w+", figure.commands))
         named |= {f"precompute/{skin}.toml" for skin in re.findall(r"-D skin=(\w+)", figure.commands)}
         for name, rest in re.findall(r"mitsuba-diffraction (\w+)(.*)", figure.commands.replace("\\\n", " ")):
-            options.setdefault(name, set()).update(re.findall(r" (--?\w[\w-]*)", rest))
+            options.setdefault(name, set()).update(re.findall(r" (--?[a-z][\w-]*)", rest))
     assert len(named) > 20
     for name in named:
         assert (ROOT / name).is_file(), name

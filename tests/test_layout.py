@@ -163,6 +163,25 @@ def test_the_figure_of_the_manual_shows_the_levels_in_their_order():
         assert files <= set(re.findall(r"\w+", text)), folder
 
 
+@pytest.mark.quick
+def test_the_manual_names_files_and_code_that_exist():
+    root = PACKAGE.parent
+    code = [
+        path for folder in (PACKAGE, *map(root.joinpath, ("scenes", "tests", "tools"))) for path in folder.rglob("*.py")
+    ]
+    files = [f"/{path.relative_to(root)}" for path in code] + ["/setup.py"]
+    pages = [*root.glob("*.md"), *(root / "docs").rglob("*.md"), *root.glob("[pst]*/README.md")]
+    pages.remove(root / "CHANGELOG.md")  # of earlier versions
+    for page in pages:
+        for name in re.findall(r"`(?:\.\./)?([\w/]+\.py)\b", page.read_text(encoding="utf-8")):
+            assert any(file.endswith(f"/{name}") for file in files), f"{page.name}: {name}"
+    words = set(re.findall(r"\w+", "\n".join(path.read_text(encoding="utf-8") for path in code)))
+    for page in (root / "docs" / "architecture.md", root / "CONTRIBUTING.md"):
+        for name in re.findall(r"`([A-Za-z_][\w.]*)`", page.read_text(encoding="utf-8")):
+            if not re.search(r"\.\w{1,5}$", name) and "_" in name:
+                assert name.rpartition(".")[2] in words, f"{page.name}: {name}"
+
+
 def test_nothing_depends_on_what_judges_the_product():
     judges = "mitsuba_diffraction.evaluation"
     for module in MODULES:

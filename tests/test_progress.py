@@ -57,7 +57,7 @@ def test_a_terminal_shows_a_bar_below_another(monkeypatch):
 
 
 def test_a_log_says_what_is_done_before_anything_can_be_counted(capsys, monkeypatch):
-    monkeypatch.setattr(progress, "_MIN_REPORTED_SECONDS", 0.05)
+    monkeypatch.setattr(progress, "MIN_REPORTED_SECONDS", 0.05)
     with progress.progress_bar("skin.toml", "%"), progress.stage("reading"):
         time.sleep(0.5)
     with progress.progress_bar("skin.toml", "%") as show:
@@ -80,7 +80,7 @@ def test_bytes_are_written_without_powers_of_ten(count, text):
 def test_a_notebook_shows_a_line():
     source = """
 from mitsuba_diffraction import progress
-progress._MIN_REPORTED_SECONDS = 0
+progress.MIN_REPORTED_SECONDS = 0
 with progress.progress_bar("spectrum of elaphe") as show:
     show(3, 7)
 """

@@ -22,8 +22,8 @@ if TYPE_CHECKING:
     from ..render.spectral_image import SpectralImage
 
 _log = logging.getLogger(__name__)
-_MIN_ANNOUNCED_SECONDS = 60
-_HOUR = 3600
+MIN_ANNOUNCED_SECONDS = 60
+MIN_WARNED_SECONDS = 3600
 
 
 class Stopped(Exception):
@@ -174,7 +174,7 @@ def _announce(
         planes: of the picture, in addition to one for each of its `wavelengths` (None: all).
         named: the sample count, if the scene names it.
     """
-    if estimate.seconds < _MIN_ANNOUNCED_SECONDS:
+    if estimate.seconds < MIN_ANNOUNCED_SECONDS:
         return
     planes += estimate.channels if wavelengths is None else wavelengths
     size = bytes_per_number * planes * estimate.columns * estimate.rows
@@ -185,11 +185,11 @@ def _announce(
         f"{estimate.seconds / 60:.0f} min, {bytes_text(estimate.memory)} of memory{disk}, a picture of "
         f"{bytes_text(size)} before compression",
     )
-    if named is not None and estimate.seconds > _HOUR:
+    if named is not None and estimate.seconds > MIN_WARNED_SECONDS:
         _log.warning(
             "the scene's own %d samples per pixel take about %.1f hours; --spp sets fewer, --until-error stops earlier",
             named,
-            estimate.seconds / _HOUR,
+            estimate.seconds / 3600,
         )
 
 

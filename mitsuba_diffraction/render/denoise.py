@@ -27,8 +27,8 @@ _SAMPLES_OF_GUIDES = 16  # per pixel
 _ALBEDO_WAVELENGTHS = (610.0, 550.0, 465.0)  # nm: red, green, blue
 _STEPS_PER_PIXEL = 100  # of the numerical autocorrelation
 _MIN_RESPONSE = 0.1  # lower bound of √R, for filters that remove a frequency
-_BAND_PIXELS = 2**20  # take 0.6 GB
-_BLENDED_ROWS = 64  # of two bands
+DENOISED_PIXELS = 2**20  # take 0.6 GB
+BLENDED_ROWS = 64  # of two bands
 
 
 @dataclass(frozen=True, eq=False)
@@ -138,14 +138,14 @@ def denoised_picture(scene: mi.Scene, XYZ: NDArray[np.floating]) -> NDArray[np.f
     rows, columns, _ = XYZ.shape
     dr.flush_malloc_cache()
     count = 1
-    if rows * columns > _BAND_PIXELS:
-        count = -(-rows // max(_BLENDED_ROWS, _BAND_PIXELS // columns - _BLENDED_ROWS))
+    if rows * columns > DENOISED_PIXELS:
+        count = -(-rows // max(BLENDED_ROWS, DENOISED_PIXELS // columns - BLENDED_ROWS))
     result, total = np.zeros_like(XYZ), np.zeros((rows, 1, 1), XYZ.dtype)
     for index in range(count):
-        first = max(0, rows * index // count - _BLENDED_ROWS // 2)
-        end = min(rows, rows * (index + 1) // count + _BLENDED_ROWS // 2)
+        first = max(0, rows * index // count - BLENDED_ROWS // 2)
+        end = min(rows, rows * (index + 1) // count + BLENDED_ROWS // 2)
         from_edge = np.minimum(np.arange(1, end - first + 1), np.arange(end - first, 0, -1))
-        weight = np.minimum(from_edge, _BLENDED_ROWS)[:, None, None].astype(XYZ.dtype)
+        weight = np.minimum(from_edge, BLENDED_ROWS)[:, None, None].astype(XYZ.dtype)
         result[first:end] += weight * denoised(XYZ[first:end], guides(scene, (first, end)))
         total[first:end] += weight
     return result / total

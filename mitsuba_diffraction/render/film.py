@@ -132,7 +132,7 @@ def check_memory(scene: mi.Scene, spp: int, bands: tuple[Rows, ...] | None = Non
     pixel_bytes, sample_bytes = (14 * n, 24 * n) if needs_mitsubas_film(scene.integrator()) else (8 * n + 84, 40)
     needed = columns * (largest * (pixel_bytes + sample_bytes * spp) + 8 * rows)
     dr.flush_malloc_cache()
-    if (available := _available_memory()) is not None and needed > available:
+    if (available := available_memory()) is not None and needed > available:
         raise RequestError(
             f"film: got {columns} × {rows} pixels, which take {bytes_text(needed)} of memory, wanted at most the "
             f"{bytes_text(available)} that are available"
@@ -140,7 +140,7 @@ def check_memory(scene: mi.Scene, spp: int, bands: tuple[Rows, ...] | None = Non
     return needed
 
 
-def _available_memory() -> int | None:
+def available_memory() -> int | None:
     """Return the number of bytes that processes can allocate, swap included; None if unknown."""
     try:
         entries = dict(line.split(":") for line in Path("/proc/meminfo").read_text().splitlines())

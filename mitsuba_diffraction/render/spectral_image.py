@@ -45,12 +45,12 @@ _RESERVED = frozenset(
 
 
 _JPEG_QUALITY = 95
-_PIXELS_PER_BLOCK = 2**17
+PIXELS_PER_BLOCK = 2**17
 
 
 def split_rows(rows: int, columns: int) -> list[slice]:
     """Return the blocks of rows in which large pictures are converted, to bound memory."""
-    step = max(1, _PIXELS_PER_BLOCK // columns)
+    step = max(1, PIXELS_PER_BLOCK // columns)
     return [slice(first, first + step) for first in range(0, rows, step)]
 
 

@@ -63,10 +63,10 @@ _Check = tuple[float, float, float, bool, dict[tuple[int, int], tuple[NDArray[np
 
 # Steps of F, X and (with transmission) Z at which Maxwell's equations are solved; the first that keeps the tolerance is
 # taken. X needs most, as it resolves transmission at grazing incidence; F resolves the narrow plasmons of metals.
-_SOLVED_STEPS = ((12, 15, 12), (18, 24, 18))
+SOLVED_STEPS = ((12, 15, 12), (18, 24, 18))
 # With transmission, solutions take most of the time: the table stores a third more steps, and at least these, of cubic
 # polynomials. For large periods the first entry is enough.
-_SOLVED_STEPS_TRANSMISSION = ((4, 6, 4), (6, 9, 6), (9, 15, 9), (12, 18, 12))
+SOLVED_STEPS_TRANSMISSION = ((4, 6, 4), (6, 9, 6), (9, 15, 9), (12, 18, 12))
 _MIN_STORED_STEPS = 8, 12, 8
 WAVELENGTH_NODES = 17
 _FIT_POINTS = 20  # per stored step, of the least-squares fit of a table to its polynomials
@@ -80,7 +80,7 @@ _MIN_FRACTION = 1e-12
 _MIN_SQUARE = 1e-8  # |γ²|
 _MIN_K_Y = 1e-4  # matrices are divided by k_y
 _MAX_ANOMALY_DISTANCE = 0.02  # of P or R from an integer, near a Rayleigh anomaly
-_CHECK_COUNT = 200
+CHECK_COUNT = 200
 _PAIR_WORK = 0.2  # of matching a field above and one below, in units of the eigenproblem of one field; measured
 _CHECKPOINT_SECONDS = 20.0  # between checkpoints, each of which is written as a whole
 # Directions for which the harmonics are chosen: near the normal, and oblique from both sides.
@@ -124,7 +124,7 @@ def build_rigorous(
         with stage("reference solutions"):
             surface = _Surface(height_field, settings, tolerance)
             checks = surface.checks()
-        steps = _SOLVED_STEPS if settings.transmission == "none" else _SOLVED_STEPS_TRANSMISSION
+        steps = SOLVED_STEPS if settings.transmission == "none" else SOLVED_STEPS_TRANSMISSION
         for number, solved in enumerate(steps, 1):
             with stage(f"table {number} of at most {len(steps)}"):
                 build = _Build(surface, solved, settings.polarised)
@@ -273,7 +273,7 @@ class _Surface:
         """Solve at random directions, uniform over the hemispheres, and wavelengths, uniform over the range."""
         rng = np.random.default_rng(0)
         checks = []
-        for number, (cosine, turn, fraction) in enumerate(rng.random((_CHECK_COUNT, 3))):
+        for number, (cosine, turn, fraction) in enumerate(rng.random((CHECK_COUNT, 3))):
             wavelength = self.wavelengths[0] + fraction * (self.wavelengths[1] - self.wavelengths[0])
             side = BELOW if self.transmission != "none" and number % 2 else ABOVE
             in_medium = side == BELOW and self.transmission == "interface"

@@ -42,7 +42,7 @@ _SERIES_FRACTION = 0.7  # by which a series of the amplitude is truncated
 _MAX_TRANSFORMS, _MIN_MEASURED = 400, 8
 _MEASURED_FRACTION = 0.95  # of the maximum error over κ: that of those measured, but see `_Build._measured`
 _MAX_UNPACKED_NODES = 2_000  # up to which the nodes of one κ fit unpacked into the first-level cache
-_MAX_TABLE_BYTES = 4e9
+MAX_TABLE_BYTES = 4e9
 
 Splines = SamplePowers | TileSplines
 
@@ -343,7 +343,7 @@ class _TooLargeError(RequestError):
 
 def _check_size(shape: tuple[int, int], floats: int) -> None:
     """Refuse a table of `floats` numbers per node before its memory is allocated."""
-    if 4.0 * np.prod(shape, dtype=float) * floats > _MAX_TABLE_BYTES:
+    if 4.0 * np.prod(shape, dtype=float) * floats > MAX_TABLE_BYTES:
         raise _TooLargeError(
             f"tolerance: needs {' × '.join(map(str, shape))} frequencies of {floats} numbers, more than a table of "
             "4 GB; take a larger tolerance, a smaller patch or, of a sample, a shorter coherence length"

@@ -29,7 +29,7 @@ _SUPPORT = 6.0
 # apart along each axis.
 _MAX_COHERENCE_FRACTION = 0.5
 _MIN_PIXELS = 4
-_MAX_BATCH_SIZE = 1 << 17  # numbers that are transformed at once
+MAX_BATCH_SIZE = 1 << 17  # numbers that are transformed at once
 
 
 class WindowAxis(NamedTuple):
@@ -85,7 +85,7 @@ def mean_periodogram(
     window = np.outer(y.window, x.window).astype(np.float32)
     segments = np.lib.stride_tricks.sliding_window_view(wave, window.shape)
     positions = np.array([(row, column) for row in y.starts for column in x.starts])
-    total, step = np.zeros(shape), max(1, _MAX_BATCH_SIZE // (shape[0] * shape[1]))
+    total, step = np.zeros(shape), max(1, MAX_BATCH_SIZE // (shape[0] * shape[1]))
     for first in range(0, len(positions), step):
         row, column = positions[first : first + step].T
         # Rows of zeros need no transform along x.

@@ -40,7 +40,7 @@ def recipe_file(tmp_path_factory):
 @pytest.fixture(scope="module")
 def solved(recipe_file):
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr("mitsuba_diffraction.rigorous.build_table._CHECK_COUNT", 40)
+        patch.setattr("mitsuba_diffraction.rigorous.build_table.CHECK_COUNT", 40)
         return md.Recipe.load(recipe_file).cached()
 
 
@@ -152,8 +152,8 @@ def test_the_albedo_is_that_of_the_solver(llvm, solved):
 
 def test_a_profile_by_formula_is_built_in_the_scene(llvm, monkeypatch):
     """The table has few nodes, and is not checked."""
-    monkeypatch.setattr("mitsuba_diffraction.rigorous.build_table._SOLVED_STEPS", ((6, 8, 6),))
-    monkeypatch.setattr("mitsuba_diffraction.rigorous.build_table._CHECK_COUNT", 10)
+    monkeypatch.setattr("mitsuba_diffraction.rigorous.build_table.SOLVED_STEPS", ((6, 8, 6),))
+    monkeypatch.setattr("mitsuba_diffraction.rigorous.build_table.CHECK_COUNT", 10)
     fine = {"type": "diffraction_grating", "profile": "sinusoidal", "period": 0.2, "depth": 0.05, "samples": 32}
     bsdf = mi.load_dict({**fine, "theory": "rigorous", "int_ior": 1.5, "ext_ior": 1.0, "tolerance": 0.9})
     wi = direction(30, 20)

@@ -31,6 +31,7 @@ def test_examples_are_copied_with_the_files_they_reference(command, tmp_path):
             assert (recipe.parent / scan).is_file(), recipe
 
 
+@pytest.mark.not_quick
 def test_a_changed_example_is_not_written_over(command, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     assert command("examples")[0] == 0

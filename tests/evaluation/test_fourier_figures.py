@@ -41,10 +41,8 @@ def test_the_extrema_of_a_blaze_are_the_analytic_ones():
 
 
 @pytest.mark.slow
-def test_the_figures_are_written(llvm, tmp_path, monkeypatch):
-    monkeypatch.setattr(fourier_figures, "_SURFACES", ("blaze", "blaze"))
-    monkeypatch.setattr(fourier_figures.plot_fourier_images, "__defaults__", (9,))
-    fourier_figures.save_fourier(tmp_path)
+def test_the_figures_are_written(llvm, tmp_path):
+    fourier_figures.save_fourier(tmp_path, ("blaze", "blaze"), 9)
     assert sorted(path.name for path in tmp_path.iterdir()) == sorted(fourier_figures.FILES)
     for path in tmp_path.iterdir():
         with Image.open(path) as picture:

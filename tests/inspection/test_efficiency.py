@@ -198,6 +198,7 @@ def test_a_plot_has_lines_or_a_map_for_each_order(angles, panels, tmp_path):
     assert (tmp_path / "plot.png").stat().st_size > 10_000
 
 
+@pytest.mark.not_quick
 def test_the_command_writes_numbers_and_plot(command, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     words = ("efficiency", "crossed,period=1.2,depth=0.1", "--angle", "0:20:10", "--wavelength", "500,600")

@@ -138,6 +138,7 @@ def test_an_f_is_an_f_where_it_is_seen(seen_on, int_ior):
         assert np.corrcoef(panel[::-1].mean(axis=-1).ravel(), expected.ravel())[0, 1] > 0.8
 
 
+@pytest.mark.not_quick
 def test_a_design_depends_on_its_seed_alone(laser):
     again = md.design(lopsided(), wavelengths=532, **SMALL)
     other = md.design(lopsided(), wavelengths=532, seed=1, **SMALL)
@@ -145,6 +146,7 @@ def test_a_design_depends_on_its_seed_alone(laser):
     assert not np.array_equal(other.height_field.heights, laser.height_field.heights)
 
 
+@pytest.mark.not_quick
 def test_a_search_among_levels_beats_rounding(laser):
     stepped = md.design(lopsided(), wavelengths=532, levels=8, tool_blur=0, **SMALL)
     assert len(np.unique(stepped.height_field.heights.round(9))) <= 8
@@ -155,6 +157,7 @@ def test_a_search_among_levels_beats_rounding(laser):
     assert stepped.efficiency[0] > 1.1 * rounded.efficiency[0]
 
 
+@pytest.mark.not_quick
 def test_the_time_and_the_memory_of_a_design_are_told_before_it(monkeypatch):
     told = []
     monkeypatch.setattr("mitsuba_diffraction.inverse_design.search._seconds", lambda *_: 0.01)
@@ -176,6 +179,7 @@ def test_the_time_and_the_memory_of_a_design_are_told_before_it(monkeypatch):
     assert 0.3 * memory < peak < 1.5 * memory
 
 
+@pytest.mark.not_quick
 def test_a_prediction_has_no_lobe_of_every_order_in_memory():
     """16,000 orders over 801 bins would take 0.3 GB."""
     plate = Plate(
@@ -202,6 +206,7 @@ def test_an_interrupted_design_is_the_best_so_far(laser):
     assert 0.5 < found.efficiency[0] < laser.efficiency[0]
 
 
+@pytest.mark.not_quick
 def test_errors_of_making_are_those_of_another_relief(laser):
     deeper = md.HeightField(1.05 * laser.height_field.heights, laser.height_field.pixel_size)
     spectrum = spectrum_of(deeper, laser)
@@ -215,6 +220,7 @@ def test_errors_of_making_are_those_of_another_relief(laser):
     assert abs(found - laser.efficiency[0]) > 0.005
 
 
+@pytest.mark.not_quick
 def test_white_light_is_directed_at_all_wavelengths():
     found = md.design(lopsided(), texel=1.0, texels=16, starts=3)
     between = found.efficiencies(np.array([440.0, 500.0, 560.0, 620.0]))

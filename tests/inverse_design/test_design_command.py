@@ -27,6 +27,7 @@ def folder(tmp_path, monkeypatch):
     Path("cut.png").write_bytes(Path("flag.png").read_bytes()[:60])
 
 
+@pytest.mark.not_quick
 def test_a_design_is_written_as_relief_recipe_and_picture(command):
     code, said, error = command(f"design flag.png {OPTIONS} --seed 3 -o plate.gsf")
     assert (code, error) == (0, "")
@@ -47,6 +48,7 @@ def test_a_design_is_written_as_relief_recipe_and_picture(command):
     check_outputs([], [("-o", path) for path in Path().glob("plate.*")])
 
 
+@pytest.mark.not_quick
 def test_files_for_makers_are_written(command):
     code, said, _ = command(
         f"design flag.png {OPTIONS} --levels 4 --export stl --export master --export gds -o step.gsf"

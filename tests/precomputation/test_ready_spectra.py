@@ -14,6 +14,7 @@ from mitsuba_diffraction.render.scene import load_spectral_scene
 ROOT = Path(__file__).parents[2]
 
 
+@pytest.mark.not_quick
 @pytest.mark.parametrize(
     "name", [pytest.param(name, marks=() if name == "elaphe_afm" else pytest.mark.slow) for name in ready_spectra.NAMES]
 )

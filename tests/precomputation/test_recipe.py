@@ -366,6 +366,7 @@ def test_a_spectrum_in_use_is_neither_built_nor_read_again(own_cache, builds):
     assert len(builds) == 1
 
 
+@pytest.mark.not_quick
 @pytest.mark.few(2)
 @pytest.mark.parametrize(
     ("surface", "spectrum"),
@@ -634,6 +635,7 @@ tolerance = 0.05
 """
 
 
+@pytest.mark.not_quick
 @pytest.mark.few(2)
 @pytest.mark.parametrize(
     ("line", "reads"),

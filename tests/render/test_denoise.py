@@ -194,8 +194,8 @@ def test_a_picture_denoised_in_bands_is_that_denoised_as_a_whole(llvm, tmp_path,
     noisy = (wanted * rng.exponential(size=(8, 160, 64, 3)).mean(0)).astype(np.float32)
     whole = denoised_picture(scene, noisy)
     np.testing.assert_allclose(whole, denoised(noisy, guides(scene)), rtol=1e-5)
-    monkeypatch.setattr(denoise, "_BAND_PIXELS", 86 * 64)
-    monkeypatch.setattr(denoise, "_BLENDED_ROWS", 32)
+    monkeypatch.setattr(denoise, "DENOISED_PIXELS", 86 * 64)
+    monkeypatch.setattr(denoise, "BLENDED_ROWS", 32)
     banded = denoised_picture(scene, noisy)
     assert (noisy / wanted).std() > 0.3
     assert (banded / wanted).std() < 0.05

@@ -1,5 +1,6 @@
 """Every error of `render/` that no other test provokes, each in one line."""
 
+import asyncio
 import re
 import sys
 from types import SimpleNamespace
@@ -54,7 +55,7 @@ def test_requests_that_cannot_be_met(llvm, tmp_path, monkeypatch):
     one_line("in the place of a BSDF that transmits light", lambda: load_spectral_scene(path, materials=grating))
     one_line("spp: got 0, wanted a positive number", lambda: render(path, spp=0))
     one_line("wanted at most .* for so large a picture", lambda: split(load_spectral_scene(path), 10**14))
-    monkeypatch.setattr(film, "_available_memory", lambda: 1000)
+    monkeypatch.setattr(film, "available_memory", lambda: 1000)
     one_line("film: got 8 × 8 pixels, which take .* that are available", lambda: render(path, spp=1))
     monkeypatch.setitem(sys.modules, "pyoidn", None)
     one_line("--denoise: pyoidn is not installed", denoise.check_requirements)
@@ -133,9 +134,9 @@ def test_workers_that_fail(monkeypatch):
     distributed = pytest.importorskip("distributed")
 
     async def answers(address):
-        return None
+        return SimpleNamespace(close=lambda: asyncio.sleep(0))
 
-    monkeypatch.setattr(cluster, "_check_scheduler", answers)
+    monkeypatch.setattr(distributed.comm, "connect", answers)
     job = SimpleNamespace(samples=(1,), bands=((0, 1),))
     worker = SimpleNamespace(address="tcp://a:2")
     for error, message in (

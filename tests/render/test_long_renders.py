@@ -471,14 +471,14 @@ def test_the_command_announces_long_renderings_and_takes_an_exposure(command, mo
     code, out, err = command(f"{RENDER} -o out.exr --exposure -1.5")
     assert (code, err) == (0, "")
     assert "out.png: preview, exposed by -1.50 stops (--exposure -1.50)" in out
-    monkeypatch.setattr(module, "_MIN_ANNOUNCED_SECONDS", 0)
+    monkeypatch.setattr(module, "MIN_ANNOUNCED_SECONDS", 0)
     code, out, err = command(f"{RENDER} -o out.exr --spp 4")
     assert code == 0
     assert "16 × 16 pixels, 4 samples per pixel: about 0 min, 224 kB of memory" in err
     assert "a picture of 49 kB before compression" in err
     assert len(err.splitlines()) == 1
     assert re.search(r"exposed by \+?(-?\d+\.\d\d) stops \(--exposure \1\)", out)
-    monkeypatch.setattr(module, "_HOUR", 1e-9)
+    monkeypatch.setattr(module, "MIN_WARNED_SECONDS", 0)
     code, out, err = command(f"{RENDER} -o out.exr --overwrite")
     assert code == 0
     assert "the scene's own 3 samples per pixel take about" in err

@@ -486,10 +486,10 @@ def test_wrong_requests_are_refused(llvm, tmp_path):
 def test_a_picture_that_does_not_fit_into_memory_is_refused_before_it_is_traced(llvm, tmp_path, monkeypatch):
     path = write_scene(tmp_path, CONSTANT)
     monkeypatch.setattr(passes, "trace_pass", None)
-    monkeypatch.setattr(film, "_available_memory", lambda: 5 * 10**8)
+    monkeypatch.setattr(film, "available_memory", lambda: 5 * 10**8)
     with pytest.raises(ValueError, match=r"3840 × 2160 pixels, which take 935 MB of memory, .* the 500 MB"):
         render(path, spp=8, width=3840, height=2160)
-    monkeypatch.setattr(film, "_available_memory", lambda: None)
+    monkeypatch.setattr(film, "available_memory", lambda: None)
     with pytest.raises(TypeError, match="not callable"):
         render(path, spp=8, width=3840, height=2160)
 
@@ -497,7 +497,7 @@ def test_a_picture_that_does_not_fit_into_memory_is_refused_before_it_is_traced(
 @pytest.mark.skipif(not Path("/proc/meminfo").exists(), reason="Linux alone reports it")
 def test_the_available_memory_is_that_of_the_system():
     pages = os.sysconf("SC_AVPHYS_PAGES") * os.sysconf("SC_PAGE_SIZE")
-    assert 0.5 * pages < film._available_memory()
+    assert 0.5 * pages < film.available_memory()
 
 
 DIRECTIONAL = '<emitter type="directional"><vector name="direction" x="0" y="0" z="-1"/></emitter>'

@@ -52,7 +52,7 @@ def test_the_file_has_the_spectral_layout(image, tmp_path):
 
 
 def test_alpha_is_a_channel_of_the_file_and_of_the_preview(tmp_path, monkeypatch):
-    monkeypatch.setattr(spectral_image, "_PIXELS_PER_BLOCK", 8)  # two rows
+    monkeypatch.setattr(spectral_image, "PIXELS_PER_BLOCK", 8)  # two rows
     alpha = np.linspace(0, 1, 5 * 4).reshape(5, 4)
     image = SpectralImage(GRID, alpha[..., None] * np.linspace(1, 2, GRID.size), alpha=alpha)
     image.save(tmp_path / "a.exr")

@@ -304,6 +304,7 @@ def test_deep_gold_at_grazing_incidence_converges():
     assert 0.8 < found.p.sum() < found.s.sum() < 1
 
 
+@pytest.mark.not_quick
 def test_too_few_harmonics_raise_a_warning():
     surface = gratings.sinusoidal(0.5, 4.0)
     with pytest.warns(UserWarning, match=r"error of 0\.\d+ with 80 harmonics, wanted at most 1e-09") as warnings:

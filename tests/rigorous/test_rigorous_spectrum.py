@@ -24,9 +24,9 @@ def coarse(steps, request):
     """Build a table of few steps, its error measured by few checks."""
     with pytest.MonkeyPatch.context() as patch, warnings.catch_warnings():
         warnings.simplefilter("ignore")
-        for name in ("_SOLVED_STEPS", "_SOLVED_STEPS_TRANSMISSION"):
+        for name in ("SOLVED_STEPS", "SOLVED_STEPS_TRANSMISSION"):
             patch.setattr(build_table, name, (steps,))
-        patch.setattr(build_table, "_CHECK_COUNT", 40)
+        patch.setattr(build_table, "CHECK_COUNT", 40)
         return build_rigorous(SURFACE, request)
 
 
@@ -84,8 +84,8 @@ def test_light_at_grazing_incidence_is_reflected_into_order_zero(spectrum):
 )
 def test_no_efficiency_of_a_coarse_table_exceeds_one(depth, material, monkeypatch):
     """The harmonics of the table suffice for most directions, not for all."""
-    monkeypatch.setattr("mitsuba_diffraction.rigorous.build_table._SOLVED_STEPS", ((3, 4, 3),))
-    monkeypatch.setattr("mitsuba_diffraction.rigorous.build_table._CHECK_COUNT", 2)
+    monkeypatch.setattr("mitsuba_diffraction.rigorous.build_table.SOLVED_STEPS", ((3, 4, 3),))
+    monkeypatch.setattr("mitsuba_diffraction.rigorous.build_table.CHECK_COUNT", 2)
     surface = gratings.blazed(0.5, depth, samples=256)
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")
@@ -94,6 +94,7 @@ def test_no_efficiency_of_a_coarse_table_exceeds_one(depth, material, monkeypatc
     assert table.values.max() <= 1
 
 
+@pytest.mark.not_quick
 def test_a_profile_that_does_not_converge_is_refused():
     with pytest.raises(
         ValueError, match=r"error of 0\.\d+ with 80 harmonics at a wavelength of 400 nm, wanted at most"
@@ -182,7 +183,7 @@ def test_transmitted_efficiencies_are_reciprocal(glass, cosine, turn, side, wave
 
 def test_matrices_of_reversed_light_agree_with_the_solver(glass, monkeypatch):
     """The table does not store light from below to above; the sheet has its own closed sum for it."""
-    monkeypatch.setattr("mitsuba_diffraction.rigorous.build_table._CHECK_COUNT", 30)
+    monkeypatch.setattr("mitsuba_diffraction.rigorous.build_table.CHECK_COUNT", 30)
     surface = build_table._Surface(SURFACE, replace(REQUEST, transmission=glass.transmission), 0.2)
     errors = []
     for alpha, g, wavelength, near, orders in surface.checks():
@@ -271,9 +272,10 @@ def test_an_interrupted_build_resumes(tmp_path):
     assert not list(tmp_path.iterdir())
 
 
+@pytest.mark.not_quick
 def test_progress_in_per_cent_begins_anew_with_a_finer_table(monkeypatch):
-    monkeypatch.setattr(build_table, "_SOLVED_STEPS", ((3, 3, 3), (4, 4, 4), (5, 5, 5)))
-    monkeypatch.setattr(build_table, "_CHECK_COUNT", 2)
+    monkeypatch.setattr(build_table, "SOLVED_STEPS", ((3, 3, 3), (4, 4, 4), (5, 5, 5)))
+    monkeypatch.setattr(build_table, "CHECK_COUNT", 2)
     reports = []
     with pytest.warns(UserWarning, match="with 5 steps per interval"):
         build_rigorous(
@@ -317,11 +319,12 @@ def test_the_work_of_a_job_is_the_number_of_its_eigenproblems(transmission, monk
     assert max(work) >= 5 * min(each for each in work if each)
 
 
+@pytest.mark.not_quick
 @pytest.mark.filterwarnings("ignore:rigorous table")  # of few steps
 def test_a_build_succeeds_without_a_usable_checkpoint(tmp_path, monkeypatch):
     """The folder cannot be written to, or the checkpoint is damaged."""
-    monkeypatch.setattr(build_table, "_SOLVED_STEPS", ((6, 8, 6),))
-    monkeypatch.setattr(build_table, "_CHECK_COUNT", 10)
+    monkeypatch.setattr(build_table, "SOLVED_STEPS", ((6, 8, 6),))
+    monkeypatch.setattr(build_table, "CHECK_COUNT", 10)
     small = gratings.sinusoidal(0.15, 0.03, samples=32)
     wanted = build_rigorous(small, REQUEST, checkpoints=tmp_path / "good").values
     (tmp_path / "file").write_text("")

@@ -18,6 +18,7 @@ def ignore(done, total):
     pass
 
 
+@pytest.mark.not_quick
 @pytest.mark.few(1)
 @pytest.mark.parametrize(("terms", "divisor"), [(3, 192), (4, 3072)])
 @given(

@@ -87,6 +87,7 @@ def surfaces(draw, depths):
     return HeightField(heights * draw(st.sampled_from(depths)), pixel)
 
 
+@pytest.mark.not_quick
 @given(
     field=surfaces([0.0, 0.02, 0.3, 1.0, 5.0]),
     tolerance=st.sampled_from(TOLERANCES),
@@ -615,7 +616,7 @@ def test_a_flat_sample_has_the_spectrum_of_the_window():
 
 @pytest.mark.parametrize("extent", ["tile", "sample"])
 def test_too_large_a_table_is_refused(monkeypatch, extent):
-    monkeypatch.setattr(importlib.import_module("mitsuba_diffraction.spectrum.build"), "_MAX_TABLE_BYTES", 2e3)
+    monkeypatch.setattr(importlib.import_module("mitsuba_diffraction.spectrum.build"), "MAX_TABLE_BYTES", 2e3)
     field, coherence_length = SAMPLES["odd"]
     with pytest.raises(
         ValueError, match=r"tolerance: needs .*more than a table of .*larger tolerance, a smaller patch"
@@ -629,7 +630,7 @@ def test_a_table_too_large_in_one_format_takes_the_next(monkeypatch):
     assert first.words_per_node == 1
     module = importlib.import_module("mitsuba_diffraction.spectrum.build")
     # Six intervals of three terms are refused, three of four terms are not.
-    monkeypatch.setattr(module, "_MAX_TABLE_BYTES", 4 * first.values.size - 1)
+    monkeypatch.setattr(module, "MAX_TABLE_BYTES", 4 * first.values.size - 1)
     spectrum = precompute(field, tolerance=1e-2)
     assert spectrum.table.words_per_node == 2
     assert spectrum.error <= 1e-2
@@ -642,6 +643,7 @@ def test_heights_in_nanometres_are_refused_before_any_work(extent):
         precompute(field, extent=extent)
 
 
+@pytest.mark.not_quick
 def test_the_largest_height_range_can_be_raised():
     field = HeightField([[0.0, 0.0, 21.0, 21.0]], 0.08)
     with pytest.raises(ValueError, match="raise largest_height_range"):

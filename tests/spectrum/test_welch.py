@@ -112,7 +112,7 @@ def test_periodograms_are_those_of_direct_sums(shape, monkeypatch):
     x, y = WindowAxis(rng.random(5), np.array([0, 2, 6])), WindowAxis(rng.random(4), np.array([0, 5]))
     # In batches of one, and of all segments at once.
     several = [mean_periodogram(wave, x, y, shape)]
-    monkeypatch.setattr("mitsuba_diffraction.spectrum.sample._MAX_BATCH_SIZE", 1)
+    monkeypatch.setattr("mitsuba_diffraction.spectrum.sample.MAX_BATCH_SIZE", 1)
     several.append(mean_periodogram(wave, x, y, shape))
     rows, columns = np.arange(shape[0]), np.arange(shape[1])
     wanted = np.zeros(shape)

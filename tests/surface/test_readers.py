@@ -844,6 +844,7 @@ def write_each(path):
         path.write_text(ESRI + "1 2 3\n4 5 6\n")
 
 
+@pytest.mark.not_quick
 @pytest.mark.parametrize("name", ["scan.gwy", "scan.gsf"])
 def test_every_cut_of_a_binary_file_is_refused(tmp_path, refuse, name):
     write_each(tmp_path / name)

@@ -46,6 +46,7 @@ def test_any_name_of_a_surface_is_only_its_name(name):
     assert json.loads(data)["name"] == name
 
 
+@pytest.mark.not_quick
 def test_a_page_of_a_film_says_that_it_shows_reflected_light(command, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     code, _, error = command("view film,period=1,depth=0.02,coherence_length=2 --no-open")
@@ -164,6 +165,7 @@ def test_the_light_and_the_observer_are_those_of_colour_science():
     np.testing.assert_allclose(table[:, 3], light / (light @ wanted[:, 1]), rtol=1e-5)
 
 
+@pytest.mark.not_quick
 @pytest.mark.few(1)
 @pytest.mark.parametrize("source", ["compact_disc", "dvd", "recipe.toml"])
 def test_a_disc_opens_under_plastic_with_its_tracks_round_the_centre(source, command, tmp_path, monkeypatch):
@@ -191,6 +193,7 @@ def test_a_disc_opens_under_plastic_with_its_tracks_round_the_centre(source, com
         assert first == pytest.approx(46 / 120, rel=0.02)
 
 
+@pytest.mark.not_quick
 def test_several_surfaces_are_a_list_in_one_page(command, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     np.save("scan.npy", 0.05 * np.random.default_rng(1).random((32, 32)))

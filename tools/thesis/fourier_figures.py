@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import argparse
 import os
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -80,7 +80,7 @@ def _draw(panel: Axes, x: Array, exact: Array, interpolations: Mapping[str, tupl
     panel.legend(fontsize=9, loc="upper left")
 
 
-def plot_interpolation() -> Figure:
+def plot_interpolation(surfaces: Sequence[str] = _SURFACES) -> Figure:
     """Plot figure 3.1: a sampled signal, and transforms of tiles between their orders, interpolated in several ways.
 
     Errors are r.m.s., relative to the r.m.s. of the interpolated quantity.
@@ -105,7 +105,7 @@ def plot_interpolation() -> Figure:
     panels[0].plot(shown, signal(shown), "k.", markersize=5)
     panels[0].set_title("A random signal of 100 samples", fontsize=11)
     panels[0].set_xlabel("t / samples")
-    for panel, name, (low, high) in zip(panels[1:], _SURFACES, ((-3.5, 3.5), (52.5, 66.5)), strict=True):
+    for panel, name, (low, high) in zip(panels[1:], surfaces, ((-3.5, 3.5), (52.5, 66.5)), strict=True):
         surface = SURFACES[name]
         field = surface.height_field
         heights, kappa = field.heights[0], 4 * np.pi / _WAVELENGTH
@@ -153,13 +153,13 @@ def _square(field: HeightField) -> HeightField:
     return HeightField(np.repeat(field.heights, field.shape[1], axis=0), (pixel, pixel))
 
 
-def plot_fourier_images(terms: int = FLSS.published_terms) -> Figure:
+def plot_fourier_images(surfaces: Sequence[str] = _SURFACES, terms: int = FLSS.published_terms) -> Figure:
     """Plot figure 4.1: heights, |F{hⁿ}| of some powers n, and the extrema of all of them."""
     from matplotlib.colors import LogNorm
 
     drawn = figure(14, 5.8)
-    axes = drawn.subplots(len(_SURFACES), len(_POWERS) + 2, width_ratios=(*(1,) * (len(_POWERS) + 1), 1.5))
-    for row, name in zip(axes, _SURFACES, strict=True):
+    axes = drawn.subplots(len(surfaces), len(_POWERS) + 2, width_ratios=(*(1,) * (len(_POWERS) + 1), 1.5))
+    for row, name in zip(axes, surfaces, strict=True):
         surface = SURFACES[name]
         field = _square(surface.height_field)
         texels, height = taylor_transforms(field, terms, origin_at_centre=False, margin=0)
@@ -196,9 +196,11 @@ def plot_fourier_images(terms: int = FLSS.published_terms) -> Figure:
     return drawn
 
 
-def save_fourier(folder: str | os.PathLike[str]) -> None:
+def save_fourier(
+    folder: str | os.PathLike[str], surfaces: Sequence[str] = _SURFACES, terms: int = FLSS.published_terms
+) -> None:
     """Write `FILES` into a folder, which exists."""
-    for name, drawn in zip(FILES, (plot_interpolation(), plot_fourier_images()), strict=True):
+    for name, drawn in zip(FILES, (plot_interpolation(surfaces), plot_fourier_images(surfaces, terms)), strict=True):
         save_png(drawn, Path(folder) / name)
 
 
