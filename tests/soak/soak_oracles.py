@@ -480,14 +480,16 @@ def is_reciprocal(case: Case):
         # float32 of q at the edge of a narrow lobe, where it is cut off, and of cosines at the horizon
         scale = np.maximum(there, back)
         relative = 0.01 + 3e-5 / np.minimum(np.abs(wi[:, 2]), np.abs(wo[:, 2])) ** 2
-        floor = 1e-3 * scale.max(initial=0) + 1e-5
+        # In polarised variants 1 − R of total reflection is not exactly zero, and K grows as 1/(cos θ_i cos θ_o).
+        rounding = (1e-7 if case.c.polarised else 0.0) / np.abs(wi[:, 2] * wo[:, 2])
+        floor = 1e-3 * scale.max(initial=0) + 1e-5 + rounding[:, None]
         bad = np.abs(there - back) > relative[:, None] * scale + floor
         j = np.argmax(bad.any(-1))
         case.require(
             not bad.any(), "(d) reciprocity", wi=wi[j], wo=wo[j], there=there[j], back=back[j], count=bad.sum()
         )
-        # Polarised variants multiply the faces in another order, with other rounding errors, also of 1 − 1.
-        floor = 1e-6 * scale.max(initial=0) + (3e-6 if case.c.polarised else 1e-7)
+        # Polarised variants multiply the faces in another order, with other rounding errors.
+        floor = 1e-6 * scale.max(initial=0) + 1e-7 + rounding[:, None]
         bad = np.abs(there - radiance) > 0.1 * relative[:, None] * scale + floor
         j = np.argmax(bad.any(-1))
         case.require(not bad.any(), "(d) radiance scales with n²", wi=wi[j], wo=wo[j], there=there[j], got=radiance[j])
