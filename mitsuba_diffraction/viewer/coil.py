@@ -17,7 +17,8 @@ _LEVELS = 65535
 def coil() -> dict[str, Any] | None:
     """Return the vertices (rows, columns, 3), rows around the body and columns along it, as whole numbers; or None.
 
-    None where the package is installed without its scenes. Positions are `origin` + `step` · integer.
+    None where the package is installed without its scenes. Positions are `origin` + `step` · integer; u of
+    a column is its number times `step_of_u`, at most one.
     """
     roots = (_PACKAGE / "examples", _PACKAGE.parent)
     path = next((root / "scenes/coil/snake.ply" for root in roots if (root / "scenes/coil/snake.ply").is_file()), None)
@@ -33,4 +34,9 @@ def coil() -> dict[str, Any] | None:
     positions = grid[np.ix_(*keep)][..., :3].astype(np.float64)
     origin, step = positions.min((0, 1)), np.ptp(positions, axis=(0, 1)) / _LEVELS
     numbers = np.rint((positions - origin) / step).astype(np.uint16)
-    return {"positions": encoded(numbers), "origin": origin.tolist(), "step": step.tolist()}
+    return {
+        "positions": encoded(numbers),
+        "origin": origin.tolist(),
+        "step": step.tolist(),
+        "step_of_u": _STEP[1] / (columns - 1),
+    }

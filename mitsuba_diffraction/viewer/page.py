@@ -119,6 +119,7 @@ def _data(surface: Surface, picture: NDArray[np.float16] | None) -> dict[str, An
         "metals": _metals(surface.material.material),
         "light": encoded(_light()),
         "coil": coil(),
+        "scales": "elaphe" if "elaphe" in surface.spectrum.source else "xenopeltis",
         "heights": _heights(surface),
         "picture": None if picture is None else encoded(picture),
     }

@@ -5,6 +5,7 @@ import re
 import shutil
 from pathlib import Path
 
+import drjit as dr
 import mitsuba as mi
 import numpy as np
 import pytest
@@ -369,6 +370,108 @@ def test_the_axes_of_the_pattern_are_those_of_the_plugin(orientation, opened, ll
                 radius /= np.linalg.norm(radius)
                 along = found["wi"][0] if orientation == "radial" else -found["wi"][1]
                 assert along == pytest.approx(light @ radius, abs=2e-3)
+
+
+@pytest.fixture(scope="module")
+def blaze():
+    return Surface.named("blazed", {"depth": 0.1, "samples": 64, "coherence_length": 3.0})
+
+
+@pytest.mark.parametrize("skin", ["xenopeltis", pytest.param("elaphe", marks=pytest.mark.slow)])
+def test_the_coil_has_the_scales_of_the_scene(skin, blaze, opened, llvm):
+    """Normals and tangents at each pixel of the coil against the textures of the scene of the view."""
+    tab = opened(blaze)
+    tab.evaluate("(scales) => viewer.set({ shape: 'coil', scales, maxFrames: 1, azimuth: -60, elevation: 50 })", skin)
+    assert tab.locator("#of-coil").is_visible()
+    content = tab.evaluate("viewer.scene()")
+    assert content.count(f'"scenes/coil/{skin}_') == 2
+    scene = mi.load_string(content.replace('"scenes/', f'"{RECIPES.parent / "scenes"}/'))
+    found = call(
+        tab,
+        """() => { const { renderer, picker } = viewer, { gl, geometry } = renderer, [width, height] = renderer.drawn;
+        picker.directionsAt(0, 0);
+        gl.bindFramebuffer(gl.FRAMEBUFFER, geometry.framebuffer);
+        return geometry.textures.map((_, i) => {
+          const values = new Float32Array(4 * width * height);
+          gl.readBuffer(gl.COLOR_ATTACHMENT0 + i);
+          gl.readPixels(0, 0, width, height, gl.RGBA, gl.FLOAT, values);
+          return Array.from(values);
+        }); }""",
+    )
+    width, height = tab.evaluate("viewer.renderer.drawn")
+    position, normal, tangent = found.reshape(3, height, width, 4)[:, ::-1].reshape(3, -1, 4)
+    y, x = np.divmod(np.arange(width * height), width)
+    at = mi.Point2f((x + 0.5) / width, (y + 0.5) / height)
+    si = scene.ray_intersect(scene.sensors()[0].sample_ray(0.0, 0.5, at, mi.Point2f(0.5))[0])
+    seen = np.array(si.is_valid()) & (position[:, 3] > 0)
+    seen &= np.linalg.norm(np.array(si.p).T - position[:, :3], axis=1) < 0.01
+    assert seen.sum() > 4000
+
+    def texture(kind, filter_type):
+        path = str(RECIPES.parent / f"scenes/coil/{skin}_{kind}.exr")
+        return mi.load_dict({"type": "bitmap", "filename": path, "raw": True, "filter_type": filter_type})
+
+    mapped = mi.Normal3f(2 * texture("normals", "bilinear").eval_3(si) - 1)
+    frame = mi.Frame3f(si.sh_frame.n)
+    frame.s = dr.normalize(si.dp_du - frame.n * dr.dot(frame.n, si.dp_du))
+    frame.t = dr.cross(frame.n, frame.s)
+    n = dr.normalize(frame.to_world(mapped))
+    s = dr.normalize(si.dp_du - n * dr.dot(n, si.dp_du))
+    n, s, t, smooth = (np.array(v).T[seen] for v in (n, s, dr.cross(n, s), frame.n))
+    normal, tangent = normal[seen, :3], tangent[seen, :3]
+
+    def angle(a, b):
+        return np.rad2deg(np.arccos(np.clip((a * b).sum(1), -1, 1)))
+
+    # The slopes of whole scales are random numbers, and the texture blurs the outlines of scales.
+    assert np.median(angle(normal, smooth)) > 3
+    assert np.quantile(angle(normal, smooth), 0.9) > 15
+    assert np.median(angle(normal, n)) < 3.3
+    assert np.quantile(angle(normal, n), 0.9) < 9
+    # The directions of scales are random, too, with the same standard deviation.
+    turned = np.rad2deg(np.arctan2((tangent * t).sum(1), (tangent * s).sum(1)))
+    wanted = np.array(texture("turn", "nearest").eval_1(si))[seen]
+    assert np.median(np.abs(turned)) == pytest.approx(np.median(np.abs(wanted)), rel=0.15)
+
+
+def test_scales_take_as_much_light_as_a_normal_map(blaze, opened, llvm):
+    """The shadows of a relief, against a white surface under Mitsuba's normal map."""
+    tab = opened(blaze)
+    normal = np.array([-0.4, 0.25, 1.0])
+    normal /= np.linalg.norm(normal)
+    wi = testing.direction(np.tile([5.0, 45.0, 80.0, 88.0, 95.0], 12), np.repeat(np.arange(12) * 30.0, 5))
+    # The axes of the relief: its normal is the third.
+    s = np.cross([0.0, 1.0, 0.0], normal)
+    axes = np.stack([s / np.linalg.norm(s), np.cross(normal, s / np.linalg.norm(s)), normal])
+    pairs = np.concatenate([wi @ axes.T, np.tile(axes[:, 2], (len(wi), 1)), np.full((len(wi), 1), 500.0)], -1)
+    text = """
+      uniform highp sampler2D uIncident, uOutgoing;
+      out vec4 oValue;
+      vec4 lightAt(int n) { return vec4(0.0); }
+      vec4 lightTo(vec2 place) { return vec4(0.0); }
+      void main() {
+        ivec2 at = ivec2(gl_FragCoord.xy);
+        facet = texelFetch(uOutgoing, at, 0).xyz;
+        oValue = vec4(facing(texelFetch(uIncident, at, 0).xyz));
+      }"""
+    found = call(
+        tab,
+        """(pairs, text) => { const { renderer, state } = viewer;
+        const program = renderer.programOf(state, SHADERS.radiance_model, text);
+        const uniforms = { ...renderer.modelUniforms(state, 0), uRandom: [0, 0, 0, 0] };
+        return Array.from(renderer.evaluate(program, uniforms, Float32Array.from(pairs))); }""",
+        pairs.ravel().tolist(),
+        text,
+    )[::4]
+    bitmap = mi.Bitmap(np.tile((normal + 1) / 2, (2, 2, 1)).astype(np.float32))
+    white = {"type": "diffuse", "reflectance": {"type": "uniform", "value": 1.0}}
+    bsdf = mi.load_dict(
+        {"type": "normalmap", "normalmap": {"type": "bitmap", "bitmap": bitmap, "raw": True}, "nested": white}
+    )
+    value = testing.evaluate(bsdf, np.tile([0.0, 0.0, 1.0], (len(wi), 1)), wi, np.full((len(wi), 1), 500.0))[:, 0]
+    np.testing.assert_allclose(found * np.maximum(wi @ normal, 0) / np.pi, value, atol=1e-5)
+    assert found.min() == 0
+    assert 0.5 < np.median(found) < 1
 
 
 @pytest.mark.slow

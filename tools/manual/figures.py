@@ -137,8 +137,9 @@ FIGURES = (
         10,
     ),
     Figure(
-        ("viewer.png",),
-        "python tools/manual/viewer_picture.py {out}/viewer.png",
+        ("viewer.png", "viewer_snake.png"),
+        """python tools/manual/viewer_picture.py {out}/viewer.png
+        python tools/manual/viewer_picture.py {out}/viewer_snake.png --surface xenopeltis""",
         needs="Chromium (tools/manual/live_browser.py)",
     ),
 )

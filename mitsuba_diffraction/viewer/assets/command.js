@@ -18,12 +18,16 @@ function sceneOf(data, state, coil) {
   const named = state.fromRadius && state.shape !== "disc";
   const orientation = named ? (state.orientation === 0 ? "radial" : "tangential") : state.orientation;
   const coat = state.coat === 1 ? {} : { coat_ior: state.coat };
-  const parameters = { ...grating, ...material, ...coat, orientation, height_scale: state.heightScale, conserve_energy: false };
+  // A texture of directions for each scale, which the pattern's own angle would replace.
+  const scales = state.shape === "coil" ? state.scales : "none";
+  const turned = scales !== "none" && orientation === 0;
+  const parameters = { ...grating, ...material, ...coat, ...(turned ? {} : { orientation }), height_scale: state.heightScale, conserve_energy: false };
   const lines = Object.entries(parameters).map(([name, value]) =>
     data.integers.includes(name) ? element(name, value).replace(/float/, "integer") : element(name, value));
   if (state.hasBase && state.material === "dielectric") {
     lines.push(`<bsdf type="diffuse" name="base"><rgb name="reflectance" value="${list(linearOf(state.pigment))}"/></bsdf>`);
   }
+  if (turned) lines.push(coilTexture("orientation", scales, "turn", "nearest"));
   const note = differs && !grating.profile
     ? `  <!-- The view has a coherence length of ${state.coherenceLength.toPrecision(4)} um, the file ${own.toPrecision(4)}. -->\n` : "";
   const camera = cameraOf(state, 1, 1);
@@ -42,9 +46,11 @@ function sceneOf(data, state, coil) {
     `<string name="filename" value="scenes/coil/snake.ply"/>
     <transform name="to_world"><translate value="${list(scaled(coil.middle, -1))}"/><scale value="${coil.scale.toFixed(6)}"/></transform>
     `];
-  const bsdf = `<bsdf type="diffraction_grating">
+  const skin = `<bsdf type="diffraction_grating">
       ${lines.join("\n      ")}
     </bsdf>`;
+  const bsdf = scales === "none" ? skin : `<bsdf type="normalmap">${coilTexture("normalmap", scales, "normals", "bilinear")}
+    ${skin}</bsdf>`;
   // Light that a grating casts on a wall is found by `diffraction_path`.
   const [integrator, depth] = state.shape === "wall" ? ["diffraction_path", 3] : ["path", 2];
   const { width, height } = $("canvas");
@@ -61,6 +67,9 @@ ${state.shape === "wall" ? wallOf(state, bsdf) : `  <shape type="${shape[0]}">
   ${emitter}`}${sky}
 </scene>`;
 }
+
+const coilTexture = (name, scales, kind, filter) => `<texture type="bitmap" name="${name}">
+      <string name="filename" value="scenes/coil/${scales}_${kind}.exr"/><boolean name="raw" value="true"/><string name="filter_type" value="${filter}"/></texture>`;
 
 // A plate above a wall that it faces, and the torch at it.
 function wallOf(state, bsdf) {

@@ -1,7 +1,7 @@
 // The panel, the mouse, touch and the keyboard.
 
 const $ = (id) => document.getElementById(id);
-const CHOICES = ["shape", "material", "pigment", "right"];
+const CHOICES = ["shape", "scales", "material", "pigment", "right"];
 const SWITCHES = ["hasBase", "difference"];
 
 const NUMBERS = {
@@ -89,6 +89,7 @@ class Controls {
     $("right-name").textContent = isShader ? `${state.right.toUpperCase().replace("_", " with ")}, 2014` : "reference";
     $("divider").style.left = `${100 * state.divider}%`;
     $("divider").setAttribute("aria-valuenow", Math.round(100 * state.divider));
+    $("of-coil").hidden = state.shape !== "coil";
     const dielectric = state.material === "dielectric";
     for (const name of ["index", "hasBase", "pigment"]) $(name).disabled = !dielectric;
     $("pigment").disabled = !(dielectric && state.hasBase);

@@ -14,7 +14,8 @@ const shapeOf = (data) => (data.shape === "coil" && !data.coil ? "sphere" : data
 function firstView(data) {
   if (shapeOf(data) === "coil") {
     return { azimuth: -60, elevation: 38, distance: 4.6, lightAzimuth: -20, lightElevation: 40,
-      lightWidth: 8, lightLength: 0, sky: 0.05, hasBase: data.material.material === "", pigment: "#100c0a" };
+      lightWidth: 8, lightLength: 0, sky: 0.05, hasBase: data.material.material === "", pigment: "#100c0a",
+      scales: data.scales };
   }
   const isDielectric = data.material.material === "";
   if (shapeOf(data) === "wall") {
@@ -33,7 +34,7 @@ function firstView(data) {
 function initialState(data) {
   const { material, spectrum } = data;
   return {
-    shape: shapeOf(data), ...firstView(data), exposure: 0,
+    shape: shapeOf(data), scales: "none", ...firstView(data), exposure: 0,
     orientation: material.orientation,
     fromRadius: material.from_radius,
     heightScale: material.height_scale,
@@ -57,7 +58,7 @@ function prepareControls(data, number) {
   const options = [["dielectric", "dielectric"], ["none", "perfect mirror"], ...Object.keys(data.metals).map((m) => [m, m])];
   for (const [value, text] of options) $("material").add(new Option(text, value));
   if (shapeOf(data) !== "wall") $("shape").querySelector("[value=wall]").remove();
-  // The vertices of the coil have no texture coordinates.
+  // The coil's tangents follow its body.
   if (!data.coil || data.material.from_radius) $("shape").querySelector("[value=coil]").remove();
   $("orientation").disabled = data.material.from_radius;
   $("heightScale").max = data.material.max_height_scale;

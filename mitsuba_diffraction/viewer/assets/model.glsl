@@ -36,6 +36,7 @@ const vec3 D65 = vec3(0.9505, 1.0, 1.089);
 const float GROUND = 0.5, ZENITH = 5.0;  // radiance of the sky below the horizon and at the zenith, relative to uSky
 
 mat3 frame;  // columns: the pattern's axes and the normal
+vec3 facet = vec3(0.0, 0.0, 1.0);  // the normal of the mesh, along them
 
 float horizonGain(float x) {
   float t = max(1.0 - 0.25 * x, 0.0);

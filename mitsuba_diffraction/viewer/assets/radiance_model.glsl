@@ -113,6 +113,12 @@ vec4 lightFor(int n, vec3 wo) {
   return vec4(light.xyz, light.w * 0.5 * (high - low));
 }
 
+// What the relief of scales leaves of light: that of Mitsuba's `normalmap` (Estevez et al. 2019).
+float facing(vec3 wi) {
+  float cosine = dot(wi, facet), alpha2 = min(0.125 * (1.0 / (facet.z * facet.z) - 1.0), 1.0);
+  return cosine <= 0.0 ? 0.0 : 2.0 / (1.0 + sqrt(1.0 + alpha2 * (1.0 / (cosine * cosine) - 1.0)));
+}
+
 // Of the sky, by orders or splines drawn in proportion to their mean power, each at one wavelength.
 vec3 ofSky(vec3 wo, float transmitted) {
   const int SAMPLES = 8;
@@ -122,7 +128,7 @@ vec3 ofSky(vec3 wo, float transmitted) {
     vec4 u = fract(random.wzyx + float(k) * vec4(0.8566748838545, 0.7338918566271, 0.6287067210378, 0.5385972572236));
     if (HAS_BASE) {
       vec3 diffuse = vec3(sqrt(u.z) * vec2(cos(2.0 * PI * u.w), sin(2.0 * PI * u.w)), sqrt(1.0 - u.z));
-      result += skyIn(diffuse) * transmitted * transmittance(diffuse.z) * uPigmentColour;
+      result += facing(diffuse) * skyIn(diffuse) * transmitted * transmittance(diffuse.z) * uPigmentColour;
     }
     float at = u.x * float(uNodeCount);
     int index = min(int(at), uNodeCount - 1);
@@ -148,7 +154,7 @@ vec3 ofSky(vec3 wo, float transmitted) {
       float value = KIND == RESOLVED || KIND == LINES ? orderFactor(wi, wo, centre * lambda, perWidth)
                                                       : continuumFactor(wi, wo, tangent, perWidth);
       value *= power(m, intervalsOf(wi, wo, 1.0 / lambda)) / drawn.z * reflectance(halfCosine(wi, wo), weights.w);
-      result += 48.0 * skyIn(wi) * value * (1.0 - face(wi.z)) * (1.0 - face(wo.z)) * weights.xyz;
+      result += 48.0 * facing(wi) * skyIn(wi) * value * (1.0 - face(wi.z)) * (1.0 - face(wo.z)) * weights.xyz;
     }
   }
   return result / float(SAMPLES);
@@ -169,7 +175,7 @@ vec3 radiance(vec3 wo) {
       value *= (1.0 - face(wi.z)) * (1.0 - face(wo.z));
     }
     if (HAS_BASE) value += transmitted * transmittance(wi.z) / PI * uPigmentColour;
-    result += wi.z * light.w * value;
+    result += facing(wi) * wi.z * light.w * value;
   }
   result /= float(POINTS);
   if (uSky > 0.0) result += uSky * ofSky(wo, transmitted);

@@ -63,7 +63,7 @@ class Renderer {
     this.spectrum = new Spectrum(gl, data.spectrum, tables.table, tables.metals);
     this.matching = numbers2D(gl, tables.light, 471, 1, 4);
     this.analytic = new Program(gl, SHADERS.quad_vertex, SHADERS.analytic);
-    this.mesh = new Program(gl, SHADERS.mesh_vertex, SHADERS.mesh);
+    this.mesh = new Program(gl, SHADERS.mesh_vertex, SHADERS.scales, SHADERS.mesh);
     this.screen = new Program(gl, SHADERS.quad_vertex, SHADERS.display);
     const constants = (state) => this.constants(state);
     this.model = new Side(gl, SHADERS.model + SHADERS.radiance_model, constants, (state, frame) => this.modelUniforms(state, frame));
@@ -168,7 +168,7 @@ class Renderer {
     gl.clearBufferfi(gl.DEPTH_STENCIL, 0, 1, 0);
     gl.enable(gl.DEPTH_TEST);
     gl.enable(gl.CULL_FACE);
-    this.mesh.use({ uProjection: projectionOf(camera, jitter, width, height), uEye: camera.eye });
+    this.mesh.use({ uProjection: projectionOf(camera, jitter, width, height), uEye: camera.eye, uScales: SCALES[state.scales] });
     this.coil.mesh.draw();
     gl.disable(gl.CULL_FACE);
     gl.disable(gl.DEPTH_TEST);

@@ -54,11 +54,13 @@ void main() {
   vec4 position = texelFetch(uPosition, at, 0);
   vec4 value = vec4(0.0);
   if (position.w > 0.0) {
-    vec3 n = normalize(texelFetch(uNormal, at, 0).xyz);
-    vec3 tangent = texelFetch(uTangent, at, 0).xyz;
+    vec4 normal = texelFetch(uNormal, at, 0), along = texelFetch(uTangent, at, 0);
+    vec3 n = normalize(normal.xyz), tangent = along.xyz;
     vec3 s = normalize(tangent - n * dot(n, tangent));
     vec3 t = cross(n, s);
     frame = mat3(uCos * s + uSin * t, uCos * t - uSin * s, n);
+    facet = vec3(uCos * normal.w + uSin * along.w, uCos * along.w - uSin * normal.w, 0.0);
+    facet.z = sqrt(1.0 - dot(facet, facet));
     vec3 width = normalize(cross(vec3(0.0, 0.0, 1.0), uLight));
     lightAxes = mat3(uLightSize.x * (width * frame), uLightSize.y * (cross(uLight, width) * frame), uLight * frame);
     random = uRandom + vec4(hash(uvec2(at)), hash(uvec2(at) + 7919u), hash(uvec2(at) + 104729u), hash(uvec2(at) + 15485863u));

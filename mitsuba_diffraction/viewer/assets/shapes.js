@@ -1,12 +1,13 @@
 // The meshes of shapes; the others are found by formula (analytic.glsl).
 
+const SCALES = { none: 0, elaphe: 1, xenopeltis: 2 };
 const ANALYTIC = { sphere: 0, plate: 1, disc: 2, wall: 3 };
 
 class Mesh {
-  // A sheet of points (rows, columns), closed along its rows; the tangent follows the columns.
-  constructor(gl, points, rows, columns) {
+  // A sheet of points (rows, columns), closed along its rows; the tangent and u follow the columns, by `step` each.
+  constructor(gl, points, rows, columns, step) {
     const at = (j, i) => points.subarray(3 * (j * columns + i), 3 * (j * columns + i) + 3);
-    const vertices = new Float32Array(9 * rows * columns);
+    const vertices = new Float32Array(11 * rows * columns);
     for (let j = 0; j < rows; j++) {
       for (let i = 0; i < columns; i++) {
         const along = sum(at(j, Math.min(i + 1, columns - 1)), scaled(at(j, Math.max(i - 1, 0)), -1));
@@ -14,7 +15,8 @@ class Mesh {
         const around = sum(at(after, i), scaled(at(before, i), -1));
         const normal = cross(along, around);
         const length = Math.hypot(...normal) || 1;
-        vertices.set([...at(j, i), ...scaled(normal, 1 / length), ...unit(along)], 9 * (j * columns + i));
+        const uv = [Math.min(i * step, 1), j / (rows - 1)];
+        vertices.set([...at(j, i), ...scaled(normal, 1 / length), ...unit(along), ...uv], 11 * (j * columns + i));
       }
     }
     const indices = new Uint32Array(6 * (rows - 1) * (columns - 1));
@@ -32,9 +34,9 @@ class Mesh {
     gl.bindVertexArray(this.array);
     gl.bindBuffer(gl.ARRAY_BUFFER, gl.createBuffer());
     gl.bufferData(gl.ARRAY_BUFFER, vertices, gl.STATIC_DRAW);
-    for (let place = 0; place < 3; place++) {
+    for (let place = 0; place < 4; place++) {
       gl.enableVertexAttribArray(place);
-      gl.vertexAttribPointer(place, 3, gl.FLOAT, false, 36, 12 * place);
+      gl.vertexAttribPointer(place, place < 3 ? 3 : 2, gl.FLOAT, false, 44, 12 * place);
     }
     gl.bindBuffer(gl.ELEMENT_ARRAY_BUFFER, gl.createBuffer());
     gl.bufferData(gl.ELEMENT_ARRAY_BUFFER, indices, gl.STATIC_DRAW);
@@ -59,5 +61,5 @@ async function coilOf(gl, coil) {
   for (let i = 0; i < values.length; i++) {
     points[i] = scale * (coil.origin[i % 3] + coil.step[i % 3] * values[i] - middle[i % 3]);
   }
-  return { mesh: new Mesh(gl, points, rows, columns), middle, scale };
+  return { mesh: new Mesh(gl, points, rows, columns, coil.step_of_u), middle, scale };
 }
