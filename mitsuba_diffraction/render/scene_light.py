@@ -86,6 +86,7 @@ def max_plausible_luminance(scene: mi.Scene) -> float:
     si, light, weight = _visible_points(scene)
     sampled = mi.unpolarized_spectrum(weight) * light.pdf * dr.select(light.delta, _MAX_LOBE_VALUE, 1)
     seen = mi.unpolarized_spectrum(si.emitter(scene).eval(si))
+    dr.eval(sampled, seen)  # in one kernel, instead of one that traces rays for each wavelength
     found = np.concatenate([np.ravel(values) for values in (*sampled, *seen)])
     brightest = found[np.isfinite(found)].max(initial=0)
     return float(brightest) * _MAX_NOISE_FACTOR if brightest > 0 else np.inf
@@ -98,6 +99,7 @@ def warn_of_light_from_below(scene: mi.Scene) -> None:
     if not opaque or not scene.sensors():
         return
     si, light, weight = _visible_points(scene)
+    dr.eval(si, light, weight)  # in one kernel, instead of one that traces rays for each count
     lit = dr.any(mi.unpolarized_spectrum(weight) != 0)
     seen_above, lit_above = si.wi.z > 0, lit & (mi.Frame3f.cos_theta(si.to_local(light.d)) > 0)
     for shape in opaque:

@@ -142,6 +142,7 @@ def test_the_command_writes_its_results_and_its_plot(command, llvm, tmp_path):
     assert out.count("blazed") == 1 + 4 + 1  # a table each of speed, of shaders and of sampling
     written = json.loads((tmp_path / "out.json").read_text())
     assert 0 < written["speed and error"][0]["accuracy"]["l1"] <= 0.01
+    assert written["machine"]["cores"] >= 1
     assert len(written["real-time shader"]) == 4
     assert written["sampling"][0]["surface"] == "blazed"
     assert (tmp_path / "out.png").stat().st_size > 10_000

@@ -16,9 +16,11 @@ from mitsuba_diffraction.bsdf.device_tables import PacketTable
 from mitsuba_diffraction.errors import Bug, RequestError
 from mitsuba_diffraction.optics.color import spectrum_to_linear_sRGB, spectrum_to_XYZ
 from mitsuba_diffraction.render import film, passes, render
+from mitsuba_diffraction.render.denoise import guides
 from mitsuba_diffraction.render.film import trace_pass
 from mitsuba_diffraction.render.scene import load_spectral_scene
 from mitsuba_diffraction.render.scene_film import channel_wavelengths, channel_weights
+from mitsuba_diffraction.render.scene_light import max_plausible_luminance
 from mitsuba_diffraction.render.spectral_image import save_preview
 
 GRID = channel_wavelengths()
@@ -198,6 +200,16 @@ def test_rendering_a_scene_again_compiles_nothing(llvm, tmp_path):
         fresh.append(sum(not kernel["cache_hit"] for kernel in history))
         assert len(history) > 0
     assert fresh[1:] == [0, 0, 0, 0]
+
+
+def test_numbers_of_the_same_rays_come_from_one_kernel(llvm, tmp_path):
+    scene = load_spectral_scene(write_scene(tmp_path, SPHERE + CONSTANT))
+    for work in (max_plausible_luminance, guides):
+        dr.kernel_history_clear()
+        with dr.scoped_set_flag(dr.JitFlag.KernelHistory, True):
+            work(scene)
+            sizes = [kernel["size"] for kernel in dr.kernel_history((dr.KernelType.JIT,))]
+        assert sizes.count(max(sizes)) <= 2, work  # random numbers and rays
 
 
 @pytest.mark.parametrize("offset", [4, 16, 32])

@@ -2,9 +2,13 @@
 
 from __future__ import annotations
 
+import os
+import platform
 import statistics
 import time
 from collections.abc import Callable, Hashable, Mapping
+from importlib import metadata
+from pathlib import Path
 from typing import TypeVar
 
 import drjit as dr
@@ -58,3 +62,18 @@ def seconds(
             if repetition >= 0:
                 times[name].append(clock() - start)
     return {name: statistics.median(values) for name, values in times.items()}
+
+
+def machine() -> dict[str, object]:
+    """Return what speeds depend on: the processor, the cores of this process, the variant and the versions."""
+    try:
+        lines = Path("/proc/cpuinfo").read_text(encoding="utf-8", errors="replace").splitlines()
+    except OSError:
+        lines = []
+    models = [line.partition(":")[2].strip() for line in lines if line.startswith("model name")]
+    return {
+        "processor": models[0] if models else platform.processor() or platform.machine(),
+        "cores": len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count(),
+        "variant": mi.variant(),
+        **{name: metadata.version(name) for name in ("mitsuba", "drjit", "mitsuba-diffraction")},
+    }

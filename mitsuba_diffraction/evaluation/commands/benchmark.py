@@ -10,7 +10,7 @@ import typer
 from ...cli.arguments import HeightRange, Overwrite, PixelSize, Variant, check_suffix
 from ...errors import RequestError
 from ...files import outputs
-from ...progress import progress_bar, show
+from ...progress import progress_bar, show, table
 from ...surface.readers import read_height_field
 
 
@@ -24,7 +24,11 @@ def benchmark(
     terms: Annotated[
         bool, typer.Option("--terms", help="measure the amplitude series by number of terms instead; minutes")
     ] = False,
-    json: Annotated[Path | None, typer.Option(help="save the results (.json)")] = None,
+    pictures: Annotated[
+        bool,
+        typer.Option("--pictures", help="measure the noise of the package's scenes at equal time instead; minutes"),
+    ] = False,
+    json: Annotated[Path | None, typer.Option(help="save the results and the processor's name (.json)")] = None,
     plot: Annotated[Path | None, typer.Option(help="plot error against speed (.png)")] = None,
     overwrite: Overwrite = False,
 ) -> None:
@@ -34,6 +38,7 @@ def benchmark(
     from ...variants import choose_variant
     from ..benchmark.cases import bundled_cases, scan_case
     from ..benchmark.sampling import measure
+    from ..benchmark.speed import machine
     from ..benchmark.study import TOLERANCES, benchmark_tables, run_benchmark, save_speed_plot
 
     if plot is not None:
@@ -42,6 +47,8 @@ def benchmark(
     outputs.check_outputs([] if scan is None else [scan], writes, overwrite=overwrite)
     if terms and (scan is not None or surface or tolerance):
         raise RequestError("--terms: got other surfaces or tolerances, too; it has tiles of its own")
+    if pictures and (scan is not None or surface or tolerance or terms or plot is not None):
+        raise RequestError("--pictures: got another option than --variant and --json, too; it has scenes of its own")
     cases = bundled_cases()
     names = [case.name for case in cases]
     if unknown := set(surface or []) - set(names):
@@ -53,6 +60,9 @@ def benchmark(
     if terms:
         _measure_terms(json, plot)
         return
+    if pictures:
+        _measure_noise(json)
+        return
     with progress_bar("speed and error") as progress:
         results, shaders = run_benchmark(cases, tolerances=tolerance or TOLERANCES, progress=progress)
     with progress_bar("sampling") as progress:
@@ -61,7 +71,7 @@ def benchmark(
     show(*benchmark_tables(results, shaders, sampling), width=140)
     if json is not None:
         found = {"speed and error": results, "real-time shader": shaders, "sampling": sampling}
-        outputs.save_json(found, json)
+        outputs.save_json({"machine": machine(), **found}, json)
     if plot is not None:
         save_speed_plot(results, plot)
 
@@ -69,12 +79,25 @@ def benchmark(
 def _measure_terms(json: Path | None, plot: Path | None) -> None:
     from ..benchmark import terms
     from ..benchmark.cases import TIMED_TILES, tiles
+    from ..benchmark.speed import machine
     from ..plots import save_png
 
     with progress_bar("number of terms") as progress:
         found = terms.measure_terms(tiles(), TIMED_TILES, progress=progress)
     show(*terms.terms_tables(found), width=190)
     if json is not None:
-        outputs.save_json(found, json)
+        outputs.save_json({"machine": machine(), **outputs.plain(found)}, json)
     if plot is not None:
         save_png(terms.plot_terms(found), plot)
+
+
+def _measure_noise(json: Path | None) -> None:
+    from .. import report
+    from ..benchmark.noise import NOISE_COLUMNS, measure_noise
+    from ..benchmark.speed import machine
+
+    with progress_bar("noise of pictures") as progress:
+        found = measure_noise(progress=progress)
+    show(table(NOISE_COLUMNS, (report.cells(NOISE_COLUMNS, row) for row in found)), width=100)
+    if json is not None:
+        outputs.save_json({"machine": machine(), "noise": found}, json)

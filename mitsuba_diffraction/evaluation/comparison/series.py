@@ -143,7 +143,7 @@ def study(
             spectrum = _spectrum(scene, kind if rows else "slices")
             picture, compiling = _traced(scene, samples)
             if not rows:
-                shown = _shows_gratings(scene)
+                shown = shows_gratings(scene)
                 white = white_luminance(picture.xyz, shown)
             reference = (pictures or [picture])[0]
             radiance, expected = (one.image.radiance[shown].astype(np.float64) for one in (picture, reference))
@@ -201,7 +201,7 @@ def _traced(scene: mi.Scene, samples: int) -> tuple[Picture, float]:
     return Picture(image, sums.samples, seconds), max(0.0, compiled - begin - seconds / len(passes))
 
 
-def _shows_gratings(scene: mi.Scene) -> NDArray[np.bool_]:
+def shows_gratings(scene: mi.Scene) -> NDArray[np.bool_]:
     """Return a mask of the pixels whose centres show a grating, (height, width)."""
     sensor = scene.sensors()[0]
     columns, rows = sensor.film().crop_size()
