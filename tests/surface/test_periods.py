@@ -338,7 +338,9 @@ def test_uncertainty_is_the_spread_between_parts():
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(("name", "shortest", "longest"), [("elaphe", 1.0, 1.3), ("xenopeltis", 0.45, 0.7)])
+@pytest.mark.parametrize(
+    ("name", "shortest", "longest"), [("elaphe_synthetic", 1.0, 1.3), ("xenopeltis_synthetic", 0.45, 0.7)]
+)
 def test_crops_of_a_synthetic_skin_agree_within_their_uncertainties(name, shortest, longest):
     apart = []
     for seed in (1, 2, 3):
