@@ -122,8 +122,8 @@ def test_theories_are_compared_on_one_grating(llvm):
 @pytest.mark.slow
 def test_the_bundled_surfaces_are_those_of_the_recipes():
     cases = {case.name: case for case in bundled_cases()}
-    for name in ("elaphe", "xenopeltis"):
-        recipe = md.Recipe.load(f"precompute/{name}_synthetic.toml")
+    for name in ("elaphe_synthetic", "xenopeltis_synthetic"):
+        recipe = md.Recipe.load(f"precompute/{name}.toml")
         assert cases[name].coherence_length == recipe.settings.coherence_length
         assert cases[name].height_field.digest == recipe.height_field().digest
 
