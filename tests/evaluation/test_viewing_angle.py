@@ -41,7 +41,7 @@ SKINS = {"elaphe": (1, 1.144), "xenopeltis": (0, 1.552)}
 @functools.cache
 def small_skin(name):
     axis, period = SKINS[name]
-    surface = {"profile": name, "size": 12.0, "pixel_size": 0.085, "seed": 1}
+    surface = {"profile": f"{name}_synthetic", "size": 12.0, "pixel_size": 0.085, "seed": 1}
     recipe = md.Recipe(surface, ScalarSettings(coherence_length=10.0))
     return PublishedSurface(name, recipe, axis, period, (1e3 * period, 0.0))
 
