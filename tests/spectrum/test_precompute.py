@@ -6,6 +6,7 @@ import tracemalloc
 
 import numpy as np
 import pytest
+import scipy.fft
 from hypothesis import example, given
 from hypothesis import strategies as st
 from scipy.special import jv
@@ -351,6 +352,26 @@ def test_small_matrices_are_multiplied_on_one_thread(monkeypatch):
         assert all(pool["num_threads"] == 2 for pool in threadpool_info() if pool["user_api"] == "blas")
     assert limited
     assert all(threads == {1} for threads in limited)
+
+
+@pytest.mark.parametrize(("terms", "height"), [(8, 0.1), (40, 0.3)])
+def test_progress_of_a_series_is_that_of_its_transforms(terms, height, monkeypatch):
+    """After a tenth of the Fourier transforms, and later, the fraction done predicts their number within 1.5 times."""
+    done, steps, transform = 0, [], scipy.fft.fft2
+
+    def counted(*args, **options):
+        nonlocal done
+        done += 1
+        return transform(*args, **options)
+
+    monkeypatch.setattr(scipy.fft, "fft2", counted)
+    settings = {"extent": "tile", "representation": "chebyshev", "terms": terms}
+    height_field = md.HeightField(height * np.random.default_rng(1).random((32, 32)), 0.08)
+    precompute(height_field, **settings, progress=lambda part, whole: steps.append((done, part / whole)))
+    predicted = [count / fraction for count, fraction in steps if count >= 0.1 * done]
+    assert len(predicted) > 10
+    assert max(predicted) < 1.5 * done
+    assert min(predicted) > done / 1.5
 
 
 def test_progress_ends_at_the_total():
