@@ -93,8 +93,9 @@ import os
 os.sched_setaffinity(0, list(os.sched_getaffinity(0))[:1])
 import mitsuba_diffraction
 import mitsuba as mi
+import numpy as np
 mi.set_variant("llvm_ad_spectral")
-mi.Bitmap(mi.Bitmap.PixelFormat.Y, mi.Struct.Type.Float16, [4, 2]).write("texture.exr")
+mi.Bitmap(np.zeros((2, 4, 1), np.float16)).write("texture.exr")
 print(mi.traverse(mi.load_dict({"type": "bitmap", "filename": "texture.exr"}))["data"].shape)
 """
 

@@ -255,11 +255,18 @@ def test_spectra_of_eta_and_k_are_those_of_the_conductor(llvm):
     )
 
 
-@pytest.mark.parametrize("transmission", [pytest.param("interface", marks=pytest.mark.slow), "sheet"])
-def test_a_medium_with_dispersion_is_a_constant_one_at_each_wavelength(llvm, transmission):
+@pytest.mark.parametrize(
+    ("transmission", "conserve_energy"),
+    [
+        ("sheet", False),
+        pytest.param("sheet", True, marks=pytest.mark.slow),
+        pytest.param("interface", True, marks=pytest.mark.slow),
+    ],
+)
+def test_a_medium_with_dispersion_is_a_constant_one_at_each_wavelength(llvm, transmission, conserve_energy):
     """Directions, powers, densities and E at λ are those of a grating whose index is that at λ, for light of one λ."""
     common = {"profile": "blazed", "period": 2.5, "depth": 0.25, "ext_ior": 1.0, "transmission": transmission}
-    common |= {"type": "diffraction_grating", "coherence_length": 4.0}
+    common |= {"type": "diffraction_grating", "coherence_length": 4.0, "conserve_energy": conserve_energy}
     rng = np.random.default_rng(0)
     wi, wo = pairs(rng, 400, True)
     dispersive = mi.load_dict({**common, "int_ior": "polycarbonate"})

@@ -82,7 +82,7 @@ CASES = {
 
 @pytest.mark.parametrize("name", CASES)
 def test_case(llvm, tmp_path, name):
-    judge(CASES[name], tmp_path)
+    judge(CASES[name], tmp_path, ("value", "density"))
 
 
 def test_random_configurations(llvm, tmp_path, pytestconfig, capsys):
