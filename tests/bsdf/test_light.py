@@ -205,7 +205,8 @@ def flat(coherence_length):
 
 
 @pytest.mark.parametrize(
-    ("coherence_length", "film", "light"), [(0.1, None, 360), (0.8, None, 830), (0.8, (400, 900), 900)]
+    ("coherence_length", "film", "light"),
+    [(0.1, None, 360), pytest.param(0.8, None, 830, marks=pytest.mark.slow), (0.8, (400, 900), 900)],
 )
 def test_a_window_shorter_than_the_wavelength_is_refused(llvm, coherence_length, film, light):
     # Regression: of a coherence length of 0.1 µm, a flat mirror reflected 0.05 to 0.25.

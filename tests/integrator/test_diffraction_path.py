@@ -208,11 +208,11 @@ def assert_agree(built, depth, spp, **parameters):
 @pytest.mark.parametrize(
     ("build", "depth", "spp"),
     [
-        pytest.param(sun_alone, 3, 1024, marks=pytest.mark.slow),
+        (sun_alone, 3, 1024),
         pytest.param(partial(window, "interface"), 3, 1024, marks=pytest.mark.slow, id="enters"),
         pytest.param(partial(window, "interface", -1), 3, 1024, marks=pytest.mark.slow, id="leaves"),
         pytest.param(partial(window, "sheet"), 3, 1024, marks=pytest.mark.slow, id="relief first"),
-        pytest.param(partial(window, "sheet", -1), 3, 1024, id="flat face first"),
+        pytest.param(partial(window, "sheet", -1), 3, 1024, marks=pytest.mark.slow, id="flat face first"),
         pytest.param(films_between_lamps, 5, 2048, marks=pytest.mark.slow, id="films"),
         pytest.param(partial(films_between_lamps, "interface"), 5, 2048, marks=pytest.mark.slow, id="glass"),
         pytest.param(taylor_terms, 3, 1024, marks=pytest.mark.slow),

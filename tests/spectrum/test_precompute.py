@@ -669,7 +669,7 @@ def test_heights_in_nanometres_are_refused_before_any_work(extent):
         precompute(field, extent=extent)
 
 
-@pytest.mark.not_quick
+@pytest.mark.slow
 def test_the_largest_height_range_can_be_raised():
     field = HeightField([[0.0, 0.0, 21.0, 21.0]], 0.08)
     with pytest.raises(ValueError, match="raise largest_height_range"):

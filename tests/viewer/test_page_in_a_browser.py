@@ -95,7 +95,7 @@ def pairs_of(spectrum, count=10_000, seed=1):
     ("source", "parameters", "changes"),
     [
         pytest.param("blaze.toml", {}, {}, marks=pytest.mark.slow),
-        ("blaze.toml", {"material": "Au", "height_scale": 0.7}, {}),
+        pytest.param("blaze.toml", {"material": "Au", "height_scale": 0.7}, {}, marks=pytest.mark.slow),
         ("blaze.toml", {"material": "Au", "coat_ior": 1.6}, {}),
         pytest.param("blaze.toml", {"coat_ior": 1.35}, {"hasBase": True, "pigment": "#7c3f95"}, marks=pytest.mark.slow),
         pytest.param("foil_crossed.toml", {"material": "Al", "coat_ior": 1.5}, {}, marks=pytest.mark.slow),
@@ -161,10 +161,9 @@ def test_colours_are_integrals_over_the_wavelength(source, changes, opened):
     np.testing.assert_allclose(found[:, :3], wanted, rtol=0, atol=1e-3 * wanted.max())
 
 
-@pytest.mark.parametrize(
-    "published", [pytest.param(True, marks=pytest.mark.slow, id="published"), pytest.param(False, id="corrected")]
-)
-@pytest.mark.parametrize("source", ["blaze.toml", pytest.param("elaphe_afm.toml", marks=pytest.mark.slow)])
+@pytest.mark.slow
+@pytest.mark.parametrize("published", [True, False], ids=["published", "corrected"])
+@pytest.mark.parametrize("source", ["blaze.toml", "elaphe_afm.toml"])
 def test_colours_are_those_of_the_shader_of_2014(source, published, opened, llvm):
     """All variants in linear RGB, to 1e-3 of the largest value; the blend is not part of it."""
     surface = Surface.named(RECIPES / source, {})
@@ -243,6 +242,7 @@ def test_the_scene_of_a_view_has_file_names_without_folders(opened):
     assert tab.messages == [tab.url[:80]]
 
 
+@pytest.mark.slow
 def test_a_slider_sets_the_brightness_of_the_shader(opened):
     tab = opened(Surface.named("blazed", {"depth": 0.1, "samples": 64, "coherence_length": 3.0}))
     tab.evaluate("viewer.set({ maxFrames: 1, right: 'flss' })")
@@ -624,6 +624,7 @@ def test_a_reference_picture_is_compared(opened):
     assert tab.messages == [tab.url[:80]]
 
 
+@pytest.mark.slow
 def test_a_list_of_surfaces_shows_each(disc, opened):
     blaze = Surface.named("blazed", {"depth": 0.1, "samples": 64, "coherence_length": 3.0, "material": "Au"})
     tab = opened(disc, blaze)

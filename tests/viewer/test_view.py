@@ -46,7 +46,7 @@ def test_any_name_of_a_surface_is_only_its_name(name):
     assert json.loads(data)["name"] == name
 
 
-@pytest.mark.not_quick
+@pytest.mark.slow
 def test_a_page_of_a_film_says_that_it_shows_reflected_light(command, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     code, _, error = command("view film,period=1,depth=0.02,coherence_length=2 --no-open")
