@@ -191,7 +191,7 @@ class Configuration:
         if self.surface.by_name:
             name = {"sinusoid": "sinusoidal", "triangle": "blazed"}[self.surface.kind]
             result |= {"profile": name, "period": self.surface.period[0], "depth": self.surface.depth}
-            result |= {"coherence_length": self.coherence_length}
+            result |= {"coherence_length": self.coherence_length, "tolerance": 1e-3}
             if self.representation != "auto":
                 result["representation"] = self.representation
         else:
