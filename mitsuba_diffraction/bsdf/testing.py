@@ -86,7 +86,8 @@ def evaluate_pdf(
 
     Args:
         bsdf: of the current variant.
-        wi, wo: ω_i and ω_o, (..., 3) along dp_du, dp_dv and the normal.
+        wi: ω_i, (..., 3) along dp_du, dp_dv and the normal.
+        wo: ω_o, likewise.
         wavelengths: (..., c) in nm.
         context: the components of the BSDF; all by default.
         uv: (..., 2).
@@ -138,10 +139,11 @@ def sample(
     """Sample a BSDF.
 
     Args:
-        bsdf, context: see `evaluate_pdf`.
+        bsdf: of the current variant.
         wi: ω_i, (n, 3), for one sample each.
         wavelengths: (c,) or (n, c) in nm, as many as a ray has.
         seed: of the random numbers.
+        context: the components of the BSDF; all by default.
         uv: (n, 2) or (2,).
 
     Returns:
