@@ -428,7 +428,7 @@ def configurations(draw):
     if single and surface.depth * densest < 0.8:
         representation = draw(st.sampled_from(["auto", "auto", "chebyshev", "taylor"]))
         # Taylor series of larger heights are refused: in float32 their terms cancel.
-        if representation == "taylor" and height_range * densest * float(np.max(lateral)) > 0.4:
+        if representation == "taylor" and height_range * densest * float(np.max(lateral)) > 0.25:
             representation = "auto"
     return Configuration(
         surface=surface,
