@@ -1,4 +1,4 @@
-"""The albedo of a perfect mirror with the relief of a surface, in a white furnace.
+"""The albedo of a surface in a white furnace: of a perfect mirror with its relief, or R and T of an interface.
 
 With R = 1 and E = 1 the BSDF reflects
 
