@@ -298,6 +298,7 @@ def test_an_index_is_refused_for_which_the_spectrum_has_no_wavelengths():
         parameters.update()
 
 
+@pytest.mark.slow
 def test_other_parameters_leave_tables_of_varying_scales(monkeypatch):
     heights = {"type": "checkerboard", "color0": 0.95, "color1": 1.0}
     parameters = mi.traverse(transmitting("interface", period=1.0, depth=0.1, height_scale=heights))

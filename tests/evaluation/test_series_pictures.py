@@ -17,6 +17,7 @@ ORIGINS = ("mean", "lowest")
 WITH_TERMS = GRATING.format(profile="blazed", period=2.0, coherence=3.0, base=REQUESTED)
 
 
+@pytest.mark.slow
 def test_more_terms_and_heights_from_the_mean_have_a_smaller_error(llvm, tmp_path):
     scene = write(tmp_path / "scene.xml", SUN, WITH_TERMS)
     slices, *series = study(scene, terms=(2, 6), samples=64, width=16).rows

@@ -640,7 +640,7 @@ tolerance = 0.05
 @pytest.mark.parametrize(
     ("line", "reads"),
     [
-        ("precompute scan.npy --pixel-size 0.05 --tolerance 0.05", 1),
+        pytest.param("precompute scan.npy --pixel-size 0.05 --tolerance 0.05", 1, marks=pytest.mark.slow),
         ("precompute scan.toml", 1),
         ("inspect scan.toml", 1),
         ("render scene.xml --spp 1 --width 4 --overwrite", 1),

@@ -165,8 +165,7 @@ def test_the_light_and_the_observer_are_those_of_colour_science():
     np.testing.assert_allclose(table[:, 3], light / (light @ wanted[:, 1]), rtol=1e-5)
 
 
-@pytest.mark.not_quick
-@pytest.mark.few(1)
+@pytest.mark.slow
 @pytest.mark.parametrize("source", ["compact_disc", "dvd", "recipe.toml"])
 def test_a_disc_opens_under_plastic_with_its_tracks_round_the_centre(source, command, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
