@@ -400,7 +400,7 @@ def test_textures_lie_as_their_arrays_say(tmp_path, llvm):
 
 @pytest.mark.parametrize("name", sorted(snake.SKINS))
 def test_scales_are_domes(name, llvm):
-    """On both sides of the middle of a scale at the back, normals turn outwards, and those of its rim the most."""
+    """On both sides of the middle of a scale at the back, normals point outwards, and those of its rim the most."""
     texture = {"type": "bitmap", "filename": str(SCENES / f"coil/{name}_normals.exr"), "raw": True}
     texels = snake.texels(snake.Sweep.along(800), snake.SKINS[name], 1280)
     middle = (texels.edge < 0.1) & (np.abs(texels.v - 0.5) < 0.2) & (texels.s > 40) & (texels.s < 100)

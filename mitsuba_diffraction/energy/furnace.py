@@ -86,7 +86,7 @@ class Furnace:
         q: (n, 2) cycles/µm, the centres of components.
         widths: (n,) cycles/µm, their standard deviations.
         powers: float32 (n, K), at K equidistant κ from 0 to κ_max of the spectrum, for unscaled heights.
-        height_scale: the factor of the heights, the largest if there are several.
+        height_scale: the factor of the heights, the maximum if there are several.
         lobe_scale: the factor of the widths of lobes of orders.
         stack: the dielectric with its films, if light is transmitted.
         side: 1 if ω is above the surface, −1 if below.
@@ -117,7 +117,7 @@ class Furnace:
 
         Args:
             spectrum: S(q; κ).
-            height_scale: the factor of the heights, the largest if there are several.
+            height_scale: the factor of the heights, the maximum if there are several.
             stack: the dielectric with its films, if light is transmitted.
             lobe_scale: the factor of the widths of lobes of orders.
         """

@@ -360,10 +360,10 @@ def test_progress_of_a_series_is_that_of_its_transforms(terms, height, monkeypat
     """After a tenth of the Fourier transforms, and later, the fraction done predicts their number within 1.5 times."""
     done, steps = 0.0, []
 
-    def counted(transform, share):
+    def counted(transform, fraction):
         def call(*args, **options):
             nonlocal done
-            done += share
+            done += fraction
             return transform(*args, **options)
 
         return call
