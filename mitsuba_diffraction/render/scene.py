@@ -78,13 +78,7 @@ def load_spectral_scene(
             _trace_cast_light(state)
         if motion is not None:
             _move_first_sensor(state, motion)
-        mi.parser.transform_all(config, state)
-        _round_sample_counts(state)
-        # Serially: on several threads, Mitsuba 3.9.1 crashed once in a loop of loads and renderings.
-        config.parallel = False
-        scene = mi.parser.instantiate(config, state)
-        if isinstance(scene, mi.Scene):
-            cover_light(scene)
+        scene = instantiated(config, state)
     if not isinstance(scene, mi.Scene):
         raise RequestError(f"{path}: the file holds a {type(scene).__name__}, wanted a scene")
     if scene.integrator() is None:
@@ -92,6 +86,18 @@ def load_spectral_scene(
     if scene.integrator().aov_names():
         raise RequestError(f"{path}: the integrator gives {scene.integrator().aov_names()}, wanted radiance only")
     draw_wavelengths_of_lights(scene)
+    return scene
+
+
+def instantiated(config: mi.parser.ParserConfig, state: mi.parser.ParserState) -> mi.Object:
+    """Return the object of a parsed file, whose gratings cover its light if it is a scene; inside of `parsed`."""
+    mi.parser.transform_all(config, state)
+    _round_sample_counts(state)
+    # Serially: on several threads, Mitsuba 3.9.1 crashed once in a loop of loads and renderings.
+    config.parallel = False
+    scene = mi.parser.instantiate(config, state)
+    if isinstance(scene, mi.Scene):
+        cover_light(scene)
     return scene
 
 

@@ -9,17 +9,16 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import mitsuba as mi
-import mitsuba.parser
 import numpy as np
 from numpy.typing import NDArray
 
-from ...bsdf.light import cover_light
 from ...files.writing import examples_folder
 from ...optics.color import spectrum_to_linear_sRGB
 from ...progress import Progress, silent
 from ...render.film import pass_seed, trace_pass
 from ...render.parsed_scene import parsed
 from ...render.passes import Accumulation
+from ...render.scene import instantiated
 from ...render.scene_film import channel_wavelengths, replace_films
 from ...render.scene_light import draw_wavelengths_of_lights
 from ...settings import VISIBLE
@@ -153,10 +152,7 @@ def load_for_noise(path: Path, width: int, depth: int, gratings: bool) -> mi.Sce
                 identifier, node.props = node.props.id(), mi.Properties("roughconductor")
                 node.props.set_id(identifier)
                 node.props["material"], node.props["alpha"] = "Al", _ALPHA
-        mi.parser.transform_all(config, state)
-        config.parallel = False
-        scene = mi.parser.instantiate(config, state)
-        cover_light(scene)
+        scene = instantiated(config, state)
     draw_wavelengths_of_lights(scene)
     return scene
 
