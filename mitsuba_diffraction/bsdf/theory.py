@@ -348,16 +348,17 @@ class RigorousTheory(Theory):
         else:
             index, is_sheet = opaque(spectrum.int_ior.real), media.transmission == "sheet"
             self.interface = Interface(1.0, index, is_sheet, rigorous=True)
-        index = 1.0 if coat is None else media.index
+        self.index = 1.0 if coat is None else media.index
         shortest, longest = spectrum.wavelengths
-        self.wavelengths = shortest * index, longest * index
+        self.wavelengths = shortest * self.index, longest * self.index
 
     def cover(self, wavelengths: tuple[float, float]) -> None:
         (first, last), (shortest, longest) = wavelengths, self.wavelengths
         if first < shortest * (1 - 1e-6) or last > longest * (1 + 1e-6):
+            coated = f", those inside of the index {self.index:g}" if self.index > 1 else ""
             raise RequestError(
                 f"wavelengths: got light of {first:g} to {last:g} nm and a rigorous spectrum of {shortest:g} to "
-                f"{longest:g} nm: build it for wavelengths=({first:g}, {last:g})"
+                f"{longest:g} nm: build it for wavelengths=({first / self.index:.7g}, {last / self.index:.7g}){coated}"
             )
         self.light = wavelengths
 

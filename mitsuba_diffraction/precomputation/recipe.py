@@ -72,7 +72,7 @@ MAX_PATCHES = 1000  # of which the mean has three per cent of the speckle of one
 _BUILD_VERSION = 10
 # Spectra in the package (tools/data/ready_spectra.py), named as in the cache.
 READY_SPECTRA = Path(__file__).parents[1] / "data" / "spectra"
-_HEIGHTS_TIME_FRACTION = 0.3  # of the build, spent on the heights of several patches, roughly
+_HEIGHTS_TIME_FRACTION = 0.5  # of the build, spent on the heights of several patches: 0.1 for ridges, 0.9 for skins
 # Mitsuba constructs plugins in parallel; only one of those with the same recipe may compute its spectrum.
 _building = threading.Lock()
 # Spectra in use, by the digest of their recipe, so that all BSDFs of one recipe read its file once.

@@ -630,8 +630,13 @@ def _image(sums: BandedSums, job: Job, scene: str, complete: bool) -> SpectralIm
 
 
 def _warn_of_implausible_pixels(luminance: NDArray[np.float32], limit: float) -> None:
-    """Log a warning that names a pixel whose luminance is not finite, or else the brightest one above the limit."""
+    """Log a warning that names a pixel whose luminance is not finite, or else the brightest one above the limit.
+
+    Another one if all pixels are black.
+    """
     luminance = np.abs(luminance)
+    if not luminance.any():
+        _log.warning("the picture is black: no light reaches the camera; metal shows only lights and lit objects")
     if count := np.count_nonzero(~(luminance <= limit) | np.isinf(luminance)):
         row, column = np.unravel_index(np.argmax(luminance), luminance.shape)  # NaN counts as the maximum
         value = luminance[row, column]

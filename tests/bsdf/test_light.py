@@ -1,5 +1,7 @@
 """Light that a scene has and a table lacks: the grating covers it, or the scene is refused; it is never black."""
 
+import re
+
 import mitsuba as mi
 import numpy as np
 import pytest
@@ -93,6 +95,22 @@ def test_a_rigorous_spectrum_is_refused_outside_its_wavelengths(llvm):
     with pytest.raises(RuntimeError, match=r"light of 360 to 830 nm and a rigorous spectrum of 500 to 600 nm: build"):
         mi.load_dict(scene(bsdf))
     mi.load_dict(scene(bsdf, (510, 590)))
+
+
+@pytest.mark.slow
+def test_below_a_coat_a_rigorous_spectrum_is_refused_with_the_wavelengths_that_it_needs(llvm):
+    # Regression: light of 360 to 830 nm was refused with "build it for wavelengths=(360, 830)", those of the spectrum.
+    settings = {"theory": "rigorous", "material": "Al", "ext_ior": 1.5, "tolerance": 0.2, "coherence_length": 40.0}
+
+    def bsdf(wavelengths):
+        of = md.precompute(md.gratings.sinusoidal(0.7, 0.1), wavelengths=wavelengths, **settings)
+        return {"type": "diffraction_grating", "spectrum": of, "material": "Al", "coat_ior": 1.5}
+
+    with pytest.raises(RuntimeError, match=r"those inside of the index 1\.4") as refused:
+        mi.load_dict(scene(bsdf((360, 830))))
+    first, last = map(float, re.search(r"=\((.*), (.*)\)", str(refused.value)).groups())
+    assert (first, last) == pytest.approx((360 / 1.5, 830 / 1.5), rel=1e-3)
+    mi.load_dict(scene(bsdf((first, last))))
 
 
 def test_wavelengths_without_light_need_no_table(llvm):

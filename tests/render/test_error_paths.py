@@ -85,6 +85,14 @@ def test_pixels_that_cannot_be_are_named(luminance, message, caplog):
     assert re.search(message, caplog.text)
 
 
+def test_a_black_picture_says_so(llvm, tmp_path, caplog):
+    """Blender's default scene, a cube and a point light, with metal on it: no facet mirrors the lamp."""
+    lamp = '<emitter type="point"><point name="position" x="9" y="0" z="0"/></emitter>'
+    mirror = '<shape type="rectangle"><bsdf type="conductor"/></shape>'
+    render(write_scene(tmp_path, lamp + mirror), spp=1)
+    assert "the picture is black: no light reaches the camera" in caplog.text
+
+
 def test_pictures_that_are_none(tmp_path):
     for message, arguments in (
         (r"wavelengths: got .*, wanted \(n,\) positive and ascending", ([500, 400], np.zeros((1, 1, 2)))),

@@ -302,7 +302,7 @@ def _rigorous(surface, coherence_length, material, above, transmission):
         md.HeightField(heights, pixel),
         theory="rigorous",
         coherence_length=coherence_length,
-        wavelengths=VISIBLE,
+        wavelengths=(VISIBLE[0] / above, VISIBLE[1] / above),
         tolerance=2e-2,
         ext_ior=above,
         transmission=transmission,
