@@ -22,7 +22,8 @@ def test_relative_noise_is_the_variance_over_the_square_of_the_mean():
 @pytest.mark.slow
 def test_the_gratings_of_a_scene_are_replaced(llvm):
     for gratings in (True, False):
-        scene = load_for_noise(BLAZE, 32, 3, gratings)
+        partner = None if gratings else {"type": "roughconductor", "material": "Al"}
+        scene = load_for_noise(BLAZE, 32, partner, max_depth=3)
         assert any(gratings_in(shape.bsdf()) for shape in scene.shapes()) == gratings
         assert "IndependentSampler" in str(scene.sensors()[0].sampler())
         assert "max_depth = 3" in str(scene.integrator())
@@ -32,12 +33,23 @@ def test_the_gratings_of_a_scene_are_replaced(llvm):
 @pytest.mark.slow
 def test_a_picture_is_measured_beside_roughconductor(llvm):
     steps = []
-    (found,) = measure_noise(
+    (found,), (split,) = measure_noise(
         [BLAZE], depths=[2], width=24, samples=8, pictures=2, progress=lambda *step: steps.append(step)
     )
-    assert (found.scene, found.depth, steps[-1]) == ("blaze", 2, (5, 5))
+    assert (found.scene, found.beside, found.depth, steps) == ("blaze", "roughconductor", 2, [(1, 2), (2, 2)])
     assert min(found.seconds, found.time, found.on_gratings, found.of_picture, found.of_one_wavelength) > 0
     assert found.on_gratings_at_equal_time == found.on_gratings * found.time
+    # More samples at a point take more time, and cannot remove the noise of the points and wavelengths.
+    assert split.time > 1
+    assert 0 <= split.remaining < 1
+    assert split.noise_at_equal_time == split.noise * split.time
+
+
+@pytest.mark.slow
+def test_a_skin_is_measured_beside_the_data_driven_bsdf_too(llvm):
+    scene = BLAZE.with_name("xenopeltis.xml")
+    found, _ = measure_noise([scene], depths=[2], width=16, samples=4, pictures=2)
+    assert [one.beside for one in found] == ["roughconductor", "measured"]
 
 
 def test_the_machine_is_named(llvm):

@@ -16,7 +16,15 @@ _ANGLES, _RESOLUTION, _BANDS = 8, 32, 100
 
 
 def measured_bsdf() -> mi.BSDF:
-    """Return `measured` with the tables of a smooth isotropic lobe: 8 angles of incidence, 32², 100 bands.
+    """Return the BSDF of `write_measured`."""
+    with tempfile.TemporaryDirectory() as folder:
+        path = Path(folder) / "synthetic.bsdf"
+        write_measured(path)
+        return mi.load_dict({"type": "measured", "filename": str(path)})
+
+
+def write_measured(path: Path) -> None:
+    """Write a file for `measured` with the tables of a smooth isotropic lobe: 8 angles of incidence, 32², 100 bands.
 
     Its speed hardly depends on what the tables contain.
     """
@@ -40,7 +48,5 @@ def measured_bsdf() -> mi.BSDF:
     numbers = {name: np.ascontiguousarray(table, np.float32) for name, table in tables.items()}
     description = np.frombuffer(b"synthetic", np.uint8)
     # The writer prints a line.
-    with tempfile.TemporaryDirectory() as folder, contextlib.redirect_stdout(None):
-        path = Path(folder) / "synthetic.bsdf"
+    with contextlib.redirect_stdout(None):
         write(str(path), description=description, jacobian=np.zeros(1, np.uint8), **numbers)
-        return mi.load_dict({"type": "measured", "filename": str(path)})

@@ -1,12 +1,15 @@
-"""Noise of pictures at equal time: a scene with its gratings, and with Mitsuba's roughconductor in their place."""
+"""Noise of pictures at equal time: a scene with its gratings, and with a BSDF of Mitsuba's in their place."""
 
 from __future__ import annotations
 
+import itertools
 import os
+import tempfile
 import time
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import mitsuba as mi
 import numpy as np
@@ -23,14 +26,18 @@ from ...render.scene_film import channel_wavelengths, replace_films
 from ...render.scene_light import draw_wavelengths_of_lights
 from ...settings import VISIBLE
 from ..comparison.series import shows_gratings
+from .measured import write_measured
 
 SCENES = ("xenopeltis", "elaphe", "compact_disc", "foil", "hologram", "rainbow")
+SKINS = ("xenopeltis", "elaphe")  # held against `measured`, too
 DEPTHS = (2, 6)  # direct light alone; more
 _ALPHA = 0.08  # of the roughconductor
 _WAVELENGTH, _HALF_WIDTH = 550.0, 1.2  # nm
+_SPLIT, _MANY = 4, 16  # samples at a point
 
 NOISE_COLUMNS = {
     "scene": "{.scene}",
+    "beside": "{.beside}",
     "depth": "{.depth}",
     "time": "{.time:.2f}",
     "noise²\non gratings": "{.on_gratings:.2f}",
@@ -39,14 +46,23 @@ NOISE_COLUMNS = {
     "noise² × time\non gratings": "{.on_gratings_at_equal_time:.2f}",
     "noise² × time\nof the picture": "{.of_picture_at_equal_time:.2f}",
 }
+SPLITTING_COLUMNS = {
+    "scene": "{.scene}",
+    "time": "{.time:.2f}",
+    "noise²\non gratings": "{.noise:.2f}",
+    "noise² × time": "{.noise_at_equal_time:.2f}",
+    "noise² that\nremains": "{.remaining:.2f}",
+    "beside\nroughconductor": "{.remaining_beside_roughconductor:.2f}",
+}
 
 
 @dataclass(frozen=True)
 class Noise:
-    """A picture relative to the same with roughconductor in place of the gratings, at equal samples.
+    """A picture relative to the same with another BSDF in place of the gratings, at equal samples.
 
     Attributes:
         scene: name of its file, without extension.
+        beside: the other BSDF: `roughconductor`, or `measured` with a synthetic lobe (`write_measured`).
         depth: `max_depth` of the path tracer.
         seconds: of processor time of the picture.
         time: ratio of the times.
@@ -58,6 +74,7 @@ class Noise:
     """
 
     scene: str
+    beside: str
     depth: int
     seconds: float
     time: float
@@ -76,6 +93,33 @@ class Noise:
         return self.of_picture * self.time
 
 
+@dataclass(frozen=True)
+class Splitting:
+    """Direct light by several samples at each point that a ray hits (Mitsuba's `direct`), relative to one of each.
+
+    With n samples of the BSDF and n of the lights the noise² is V_∞ + (V_1 − V_∞)/n; V_∞ remains if the light that a
+    point reflects at the four wavelengths of a ray is known exactly, from n = 1 and 16.
+
+    Attributes:
+        scene: name of its file, without extension.
+        time: of four samples of the BSDF and one of the lights.
+        noise: noise² of the same, on pixels that show gratings.
+        remaining: V_∞/V_1.
+        remaining_beside_roughconductor: V_∞, relative to V_1 with `roughconductor` in place of the gratings.
+    """
+
+    scene: str
+    time: float
+    noise: float
+    remaining: float
+    remaining_beside_roughconductor: float
+
+    @property
+    def noise_at_equal_time(self) -> float:
+        """Ratio of noise² × time."""
+        return self.noise * self.time
+
+
 def measure_noise(
     scenes: Sequence[str | os.PathLike[str]] = (),
     *,
@@ -84,8 +128,8 @@ def measure_noise(
     samples: int = 32,
     pictures: int = 4,
     progress: Progress = silent,
-) -> list[Noise]:
-    """Measure under the current variant; pictures with and without gratings alternate, in one process.
+) -> tuple[list[Noise], list[Splitting]]:
+    """Measure under the current variant; the pictures that are compared alternate, in one process.
 
     Args:
         scenes: XML files; default: `SCENES` of the package.
@@ -96,34 +140,71 @@ def measure_noise(
         progress: called with (steps done, steps in total).
     """
     paths = [Path(scene) for scene in scenes] or [examples_folder() / "scenes" / f"{name}.xml" for name in SCENES]
-    found: list[Noise] = []
-    total = len(paths) * len(depths) * (2 * pictures + 1)
-    for path in paths:
-        for depth in depths:
-            done = len(found) * (2 * pictures + 1)
-            pair = [load_for_noise(path, width, depth, gratings) for gratings in (True, False)]
-            shown = shows_gratings(pair[0])
-            times, radiance = np.zeros((2, pictures)), np.zeros((2, pictures, *shown.shape, channel_wavelengths().size))
-            for index in range(-1, pictures):  # the first compiles
-                for kind, scene in enumerate(pair):
-                    begin = time.process_time()
-                    picture = _radiance(scene, samples, index + 1)
-                    if index >= 0:
-                        times[kind, index], radiance[kind, index] = time.process_time() - begin, picture
-                progress(done + index + 2, total)
-            grating, rough = spectrum_to_linear_sRGB(radiance, channel_wavelengths())
-            ratios = [relative_noise(grating, some) / relative_noise(rough, some) for some in (shown, shown | True)]
-            for scene in pair:
-                _draw_one_wavelength(scene)
-            for index in range(pictures):
-                for kind, scene in enumerate(pair):
-                    radiance[kind, index] = _radiance(scene, samples, index)
-                progress(done + pictures + index + 2, total)
-            grating, rough = radiance.sum(axis=-1, keepdims=True)
-            ratios.append(relative_noise(grating, shown) / relative_noise(rough, shown))
-            median = np.median(times, axis=1)
-            found.append(Noise(path.stem, depth, median[0], median[0] / median[1], *ratios))
-    return found
+    with tempfile.TemporaryDirectory() as folder:
+        table = Path(folder) / "synthetic.bsdf"
+        write_measured(table)
+        rough = {"type": "roughconductor", "material": "Al", "alpha": _ALPHA}
+        tabulated = {"type": "measured", "filename": str(table)}
+        pairs = [
+            (path, partner, depth)
+            for path in paths
+            for partner in (rough, tabulated)
+            if partner is rough or path.stem in SKINS
+            for depth in depths
+        ]
+        total, count = len(pairs) + len(paths), itertools.count(1)
+        found = []
+        for path, partner, depth in pairs:
+            scenes_of_pair = [load_for_noise(path, width, other, max_depth=depth) for other in (None, partner)]
+            found.append(_noise(path.stem, str(partner["type"]), depth, scenes_of_pair, samples, pictures))
+            progress(next(count), total)
+        split = []
+        for path in paths:
+            shadings = [(None, 1, 1), (None, 1, _SPLIT), (None, _MANY, _MANY), (rough, 1, 1)]
+            of_path = [
+                load_for_noise(path, width, other, type="direct", emitter_samples=lights, bsdf_samples=directions)
+                for other, lights, directions in shadings
+            ]
+            split.append(_splitting(path.stem, of_path, samples, pictures))
+            progress(next(count), total)
+    return found, split
+
+
+def _noise(name: str, beside: str, depth: int, pair: list[mi.Scene], samples: int, pictures: int) -> Noise:
+    shown = shows_gratings(pair[0])
+    times, radiance = _alternating(pair, samples, pictures)
+    grating, other = spectrum_to_linear_sRGB(radiance, channel_wavelengths())
+    ratios = [relative_noise(grating, some) / relative_noise(other, some) for some in (shown, shown | True)]
+    for scene in pair:
+        _draw_one_wavelength(scene)
+    grating, other = _alternating(pair, samples, pictures)[1].sum(axis=-1, keepdims=True)
+    ratios.append(relative_noise(grating, shown) / relative_noise(other, shown))
+    return Noise(name, beside, depth, times[0], times[0] / times[1], *ratios)
+
+
+def _splitting(name: str, scenes: list[mi.Scene], samples: int, pictures: int) -> Splitting:
+    shown = shows_gratings(scenes[0])
+    times, radiance = _alternating(scenes, samples, pictures)
+    one, split, many, rough = (
+        relative_noise(kind, shown) for kind in spectrum_to_linear_sRGB(radiance, channel_wavelengths())
+    )
+    remaining = max((_MANY * many - one) / (_MANY - 1), 0.0)
+    return Splitting(name, times[1] / times[0], split / one, remaining / one, remaining / rough)
+
+
+def _alternating(
+    scenes: Sequence[mi.Scene], samples: int, pictures: int
+) -> tuple[NDArray[np.float64], NDArray[np.float32]]:
+    """Render pictures of scenes in turn: medians of seconds of processor time, and (scenes, pictures, …) radiance."""
+    times, radiance = np.zeros((len(scenes), pictures)), []
+    for index in range(-1, pictures):  # the first compiles
+        for kind, scene in enumerate(scenes):
+            begin = time.process_time()
+            picture = _radiance(scene, samples, index + 1)
+            if index >= 0:
+                times[kind, index] = time.process_time() - begin
+                radiance.append(picture)
+    return np.median(times, axis=1), np.stack(radiance).reshape(pictures, len(scenes), *picture.shape).swapaxes(0, 1)
 
 
 def relative_noise(pictures: NDArray[np.float64], where: NDArray[np.bool_]) -> float:
@@ -138,23 +219,32 @@ def relative_noise(pictures: NDArray[np.float64], where: NDArray[np.bool_]) -> f
     return float(variance / ((chosen.mean(axis=0) ** 2).mean() - variance / len(chosen)))
 
 
-def load_for_noise(path: Path, width: int, depth: int, gratings: bool) -> mi.Scene:
-    """Load a scene with independent samples and the path tracer, with roughconductor in place of `gratings` or not."""
+def load_for_noise(
+    path: Path, width: int, partner: dict[str, Any] | None, type: str = "path", **integrator: int
+) -> mi.Scene:
+    """Load a scene with independent samples and another integrator; `partner` replaces its gratings, if given."""
     with parsed(path, None) as (config, state):
         replace_films(state, width, None)
         for node in state.nodes:
             if node.type == mi.ObjectType.Integrator:
-                node.props = mi.Properties("path")
-                node.props["max_depth"] = depth
+                node.props = _properties({"type": type, **integrator})
             elif node.type == mi.ObjectType.Sampler:
                 node.props = mi.Properties("independent")
-            elif node.props.plugin_name() == "diffraction_grating" and not gratings:
-                identifier, node.props = node.props.id(), mi.Properties("roughconductor")
+            elif node.props.plugin_name() == "diffraction_grating" and partner is not None:
+                identifier, node.props = node.props.id(), _properties(partner)
                 node.props.set_id(identifier)
-                node.props["material"], node.props["alpha"] = "Al", _ALPHA
         scene = instantiated(config, state)
     draw_wavelengths_of_lights(scene)
     return scene
+
+
+def _properties(values: dict[str, Any]) -> mi.Properties:
+    """Return the parameters of a plugin without nested ones."""
+    properties = mi.Properties(values["type"])
+    for name, value in values.items():
+        if name != "type":
+            properties[name] = value
+    return properties
 
 
 def _radiance(scene: mi.Scene, samples: int, seed: int) -> NDArray[np.float32]:

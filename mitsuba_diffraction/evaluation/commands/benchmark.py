@@ -93,11 +93,12 @@ def _measure_terms(json: Path | None, plot: Path | None) -> None:
 
 def _measure_noise(json: Path | None) -> None:
     from .. import report
-    from ..benchmark.noise import NOISE_COLUMNS, measure_noise
+    from ..benchmark.noise import NOISE_COLUMNS, SPLITTING_COLUMNS, measure_noise
     from ..benchmark.speed import machine
 
     with progress_bar("noise of pictures") as progress:
-        found = measure_noise(progress=progress)
-    show(table(NOISE_COLUMNS, (report.cells(NOISE_COLUMNS, row) for row in found)), width=100)
+        noise, splitting = measure_noise(progress=progress)
+    for columns, rows in ((NOISE_COLUMNS, noise), (SPLITTING_COLUMNS, splitting)):
+        show(table(columns, (report.cells(columns, row) for row in rows)), width=110)
     if json is not None:
-        outputs.save_json({"machine": machine(), "noise": found}, json)
+        outputs.save_json({"machine": machine(), "noise": noise, "splitting": splitting}, json)
