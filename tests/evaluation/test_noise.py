@@ -2,11 +2,14 @@
 
 from pathlib import Path
 
+import mitsuba as mi
 import numpy as np
 import pytest
 
 from mitsuba_diffraction.bsdf.base import gratings_in
+from mitsuba_diffraction.bsdf.testing import evaluate_pdf, sample
 from mitsuba_diffraction.evaluation.benchmark.noise import load_for_noise, measure_noise, relative_noise
+from mitsuba_diffraction.evaluation.benchmark.perfect_sampling import sample_perfectly
 from mitsuba_diffraction.evaluation.benchmark.speed import machine
 
 BLAZE = Path(__file__).parents[2] / "scenes" / "blaze.xml"
@@ -33,16 +36,42 @@ def test_the_gratings_of_a_scene_are_replaced(llvm):
 @pytest.mark.slow
 def test_a_picture_is_measured_beside_roughconductor(llvm):
     steps = []
-    (found,), (split,) = measure_noise(
+    (found,), (bounds,) = measure_noise(
         [BLAZE], depths=[2], width=24, samples=8, pictures=2, progress=lambda *step: steps.append(step)
     )
     assert (found.scene, found.beside, found.depth, steps) == ("blaze", "roughconductor", 2, [(1, 2), (2, 2)])
     assert min(found.seconds, found.time, found.on_gratings, found.of_picture, found.of_one_wavelength) > 0
     assert found.on_gratings_at_equal_time == found.on_gratings * found.time
     # More samples at a point take more time, and cannot remove the noise of the points and wavelengths.
-    assert split.time > 1
-    assert 0 <= split.remaining < 1
-    assert split.noise_at_equal_time == split.noise * split.time
+    assert bounds.time_of_four > 1
+    assert 0 <= bounds.all < 1
+    assert bounds.perfect > 0
+    assert bounds.four_at_equal_time == bounds.four * bounds.time_of_four
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    "surface",
+    [
+        {"profile": "blazed", "period": 2.5, "depth": 0.25},
+        {"profile": "crossed", "period": 2.5, "depth": 0.2, "material": "Al", "coat_ior": 1.5},
+    ],
+)
+def test_perfect_sampling_has_the_density_of_f_cos(surface, llvm):
+    """Its weights are the reflectance, and it keeps the mean of the grating's own weights."""
+    plate = {"type": "rectangle", "bsdf": {"type": "diffraction_grating", "coherence_length": 6.0, **surface}}
+    scene = mi.load_dict({"type": "scene", "plate": plate})
+    (bsdf,) = gratings_in(scene.shapes()[0].bsdf())
+    wi, wavelengths = np.broadcast_to([0.6, 0, 0.8], (20000, 3)), [550.0] * 4
+    wo, own, _ = sample(bsdf, wi, wavelengths)
+    sample_perfectly(scene)
+    _, perfect, _ = sample(bsdf, wi, wavelengths)
+    assert perfect[:, 0].mean() == pytest.approx(own[:, 0].mean(), rel=0.02)
+    assert perfect[:, 0].std() < own[:, 0].std() / 2
+    value, pdf = evaluate_pdf(bsdf, wi, wo, wavelengths)
+    rough = value[:, 0] > 0  # not the mirror image in the coat
+    # R is estimated anew for each direction.
+    assert np.abs(pdf[rough, 0] / value[rough, 0] * own[:, 0].mean() - 1).mean() < 0.2
 
 
 @pytest.mark.slow

@@ -27,13 +27,14 @@ from ...render.scene_light import draw_wavelengths_of_lights
 from ...settings import VISIBLE
 from ..comparison.series import shows_gratings
 from .measured import write_measured
+from .perfect_sampling import sample_perfectly
 
 SCENES = ("xenopeltis", "elaphe", "compact_disc", "foil", "hologram", "rainbow")
 SKINS = ("xenopeltis", "elaphe")  # held against `measured`, too
 DEPTHS = (2, 6)  # direct light alone; more
 _ALPHA = 0.08  # of the roughconductor
 _WAVELENGTH, _HALF_WIDTH = 550.0, 1.2  # nm
-_SPLIT, _MANY = 4, 16  # samples at a point
+_FOUR, _MANY = 4, 16  # samples at a point
 
 NOISE_COLUMNS = {
     "scene": "{.scene}",
@@ -46,13 +47,15 @@ NOISE_COLUMNS = {
     "noise² × time\non gratings": "{.on_gratings_at_equal_time:.2f}",
     "noise² × time\nof the picture": "{.of_picture_at_equal_time:.2f}",
 }
-SPLITTING_COLUMNS = {
+BOUND_COLUMNS = {
     "scene": "{.scene}",
-    "time": "{.time:.2f}",
-    "noise²\non gratings": "{.noise:.2f}",
-    "noise² × time": "{.noise_at_equal_time:.2f}",
-    "noise² that\nremains": "{.remaining:.2f}",
-    "beside\nroughconductor": "{.remaining_beside_roughconductor:.2f}",
+    "perfect\nsampling": "{.perfect:.2f}",
+    "beside\nroughconductor": "{.perfect_beside_roughconductor:.2f}",
+    "four samples:\ntime": "{.time_of_four:.2f}",
+    "\nnoise²": "{.four:.2f}",
+    "\nnoise² × time": "{.four_at_equal_time:.2f}",
+    "\nall samples": "{.all:.2f}",
+    "\nbeside\nroughconductor": "{.all_beside_roughconductor:.2f}",
 }
 
 
@@ -94,30 +97,34 @@ class Noise:
 
 
 @dataclass(frozen=True)
-class Splitting:
-    """Direct light by several samples at each point that a ray hits (Mitsuba's `direct`), relative to one of each.
+class Bounds:
+    """Noise² of direct light on pixels that show gratings, by more work at each point that a ray hits.
 
-    With n samples of the BSDF and n of the lights the noise² is V_∞ + (V_1 − V_∞)/n; V_∞ remains if the light that a
-    point reflects at the four wavelengths of a ray is known exactly, from n = 1 and 16.
+    All are relative to one sample of the BSDF and one of the lights, as `path` takes them. With n of each (Mitsuba's
+    `direct`), noise² is V_∞ + (V_1 − V_∞)/n; V_∞ remains if the light that a point reflects at the four wavelengths of
+    a ray is known exactly.
 
     Attributes:
         scene: name of its file, without extension.
-        time: of four samples of the BSDF and one of the lights.
-        noise: noise² of the same, on pixels that show gratings.
-        remaining: V_∞/V_1.
-        remaining_beside_roughconductor: V_∞, relative to V_1 with `roughconductor` in place of the gratings.
+        perfect: by one sample of each, and a density proportional to the mean of f cos θ_o over the wavelengths.
+        perfect_beside_roughconductor: the same, relative to `roughconductor` in place of the gratings.
+        time_of_four, four: time and noise² by four samples of the BSDF and one of the lights.
+        all: V_∞, from n = 1 and 16.
+        all_beside_roughconductor: V_∞, relative to one sample of each with `roughconductor`.
     """
 
     scene: str
-    time: float
-    noise: float
-    remaining: float
-    remaining_beside_roughconductor: float
+    perfect: float
+    perfect_beside_roughconductor: float
+    time_of_four: float
+    four: float
+    all: float
+    all_beside_roughconductor: float
 
     @property
-    def noise_at_equal_time(self) -> float:
-        """Ratio of noise² × time."""
-        return self.noise * self.time
+    def four_at_equal_time(self) -> float:
+        """Ratio of noise² × time by four samples of the BSDF."""
+        return self.four * self.time_of_four
 
 
 def measure_noise(
@@ -128,7 +135,7 @@ def measure_noise(
     samples: int = 32,
     pictures: int = 4,
     progress: Progress = silent,
-) -> tuple[list[Noise], list[Splitting]]:
+) -> tuple[list[Noise], list[Bounds]]:
     """Measure under the current variant; the pictures that are compared alternate, in one process.
 
     Args:
@@ -158,16 +165,17 @@ def measure_noise(
             scenes_of_pair = [load_for_noise(path, width, other, max_depth=depth) for other in (None, partner)]
             found.append(_noise(path.stem, str(partner["type"]), depth, scenes_of_pair, samples, pictures))
             progress(next(count), total)
-        split = []
+        bounds = []
         for path in paths:
-            shadings = [(None, 1, 1), (None, 1, _SPLIT), (None, _MANY, _MANY), (rough, 1, 1)]
+            shadings = [(None, 1, 1), (None, 1, 1), (None, 1, _FOUR), (None, _MANY, _MANY), (rough, 1, 1)]
             of_path = [
                 load_for_noise(path, width, other, type="direct", emitter_samples=lights, bsdf_samples=directions)
                 for other, lights, directions in shadings
             ]
-            split.append(_splitting(path.stem, of_path, samples, pictures))
+            sample_perfectly(of_path[1])
+            bounds.append(_bounds(path.stem, of_path, samples, pictures))
             progress(next(count), total)
-    return found, split
+    return found, bounds
 
 
 def _noise(name: str, beside: str, depth: int, pair: list[mi.Scene], samples: int, pictures: int) -> Noise:
@@ -182,14 +190,14 @@ def _noise(name: str, beside: str, depth: int, pair: list[mi.Scene], samples: in
     return Noise(name, beside, depth, times[0], times[0] / times[1], *ratios)
 
 
-def _splitting(name: str, scenes: list[mi.Scene], samples: int, pictures: int) -> Splitting:
+def _bounds(name: str, scenes: list[mi.Scene], samples: int, pictures: int) -> Bounds:
     shown = shows_gratings(scenes[0])
     times, radiance = _alternating(scenes, samples, pictures)
-    one, split, many, rough = (
+    one, perfect, four, many, rough = (
         relative_noise(kind, shown) for kind in spectrum_to_linear_sRGB(radiance, channel_wavelengths())
     )
-    remaining = max((_MANY * many - one) / (_MANY - 1), 0.0)
-    return Splitting(name, times[1] / times[0], split / one, remaining / one, remaining / rough)
+    rest = max((_MANY * many - one) / (_MANY - 1), 0.0)
+    return Bounds(name, perfect / one, perfect / rough, times[2] / times[0], four / one, rest / one, rest / rough)
 
 
 def _alternating(
