@@ -35,6 +35,11 @@ BLAZED = '<string name="profile" value="blazed"/><float name="period" value="2.5
         (GRATING % (BLAZED + '<string name="height_scale" value="a"/>'), {}, "height_scale: got 'a', wanted a number"),
         (GRATING % '<float name="filename" value="1"/>', {}, r"filename: got 1.0, wanted a saved spectrum"),
         (GRATING % '<string name="filename" value="$skin"/>', {}, r"undefined parameter: \$skin; set it by -D skin=…"),
+        (
+            GRATING % '<string name="filename" value="$skin"/>',
+            {"skn": "elaphe"},
+            r"undefined parameter: \$skin; set it by -D skin=… instead of skn",
+        ),
         (GRATING % (BLAZED + '<string name="theory" value="exact"/>'), {}, "theory: got 'exact', wanted one of scalar"),
         (
             GRATING % '<string name="filename" value="skin.exr"/><float name="tolerance" value="0.1"/>',
@@ -69,6 +74,9 @@ def test_messages_name_what_is_available(body, parameters, words, tmp_path, llvm
             "shader: got 'stam', wanted one of flss, nmm, pq, nmm_pq, gem",
         ),
         ("convergence scenes/blaze.xml -o out.png", "shader knows no other; choose -D light=bulb or -D light=parallel"),
+        ("render scenes/blaze.blend", "got a file of Blender, wanted a scene (.xml), which Mitsuba-Blender exports"),
+        ("render moved/scan.xml", "moved/scan.xml: no such file; mitsuba-diffraction examples writes it"),
+        ("inspect scan.png --hight-range 1", "(try mitsuba-diffraction inspect --help)"),
         (
             "render scenes/lights",
             "wanted a scene (.xml); this folder holds bulb.xml, desk_lamp.xml, lamp.xml, lamps.xml, "

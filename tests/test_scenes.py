@@ -85,7 +85,8 @@ def test_scene_of_transmitted_light_renders(llvm, name, parameters):
 def test_scene_of_a_scan_renders(llvm, tmp_path):
     path = tmp_path / "spectrum.exr"
     md.precompute(md.gratings.elaphe_synthetic(8)).save(path)
-    check(render(SCENES / "scan.xml", spp=4, width=16, height=16, parameters={"spectrum": str(path)}), 16, 16)
+    for name, parameter in (("scan", "spectrum"), ("elaphe", "skin")):
+        check(render(SCENES / f"{name}.xml", spp=4, width=16, height=16, parameters={parameter: str(path)}), 16, 16)
 
 
 ON_ONE_CORE = """

@@ -140,7 +140,8 @@ def _report(error: BaseException, debug: bool = False) -> int:
         say("interrupted", error if isinstance(error, Stopped) else "nothing was written")
         return 130
     if isinstance(error, _UsageError):
-        say("error", f"{error.format_message()} (try {NAME} --help)")
+        command = error.ctx.command_path if error.ctx else NAME
+        say("error", f"{error.format_message()} (try {command} --help)")
         return 2
     if debug:
         traceback.print_exception(error)

@@ -70,7 +70,7 @@ def surface_of(text: str) -> tuple[str, dict[str, Value]]:
             raise RequestError(f"{text}: got {name + equals + value!r}, wanted name=value, each name once")
         values[name] = converted(value)
     if source in RENAMED:
-        say("note", f"{source}: the measured skin; the synthetic one, which had this name, is {RENAMED[source]}")
+        say("note", f"{source} is the measured skin; {RENAMED[source]} is a synthetic one")
     return source_named(source), values
 
 

@@ -52,7 +52,7 @@ def check_outputs(
     for option, path in writes:
         if read := next((read for read in reads if _is_same(path, read)), None):
             by = "" if os.path.abspath(path) == os.path.abspath(read) else f" as {read}"
-            raise RequestError(f"{option}: got {path}, which is read{by} and would be lost; wanted another name")
+            raise RequestError(f"{option}: would overwrite {path}, which is read{by}; wanted another name")
         name = os.path.realpath(path).casefold()  # names that differ in case only may be the same file
         if name in planned:
             raise RequestError(f"{option}: {path} would be written twice, for {planned[name]} too; wanted another name")

@@ -45,8 +45,12 @@ def parsed(
     if path.is_dir():
         scenes = ", ".join(sorted(file.name for file in path.glob("*.xml"))) or "none"
         raise RequestError(f"{path}: got a folder, wanted a scene (.xml); this folder holds {scenes}")
+    if path.suffix == ".blend":
+        raise RequestError(f"{path}: got a file of Blender, wanted a scene (.xml), which Mitsuba-Blender exports")
     if not path.is_file():
-        raise FileNotFoundError(f"{path}: no such file")
+        is_example = (examples_folder() / "scenes" / path.name).is_file()
+        hint = "; mitsuba-diffraction examples writes it" if is_example else ""
+        raise FileNotFoundError(f"{path}: no such file{hint}")
     resolver = mi.file_resolver()
     beside_scene = mi.FileResolver(resolver)
     beside_scene.prepend(str(path.resolve().parent))
@@ -60,19 +64,20 @@ def parsed(
         _refuse_missing_files(path, state)
         yield config, state
     except Exception as error:
-        raise RequestError(f"{path}: {root_cause(error)}{_alternatives(path, str(error))}") from error
+        raise RequestError(f"{path}: {root_cause(error)}{_alternatives(path, str(error), parameters or {})}") from error
     finally:
         mi.set_file_resolver(resolver)
 
 
-def _alternatives(scene: Path, error: str) -> str:
+def _alternatives(scene: Path, error: str, parameters: Mapping[str, str]) -> str:
     """Return the alternatives to a missing include, plugin or parameter, as the end of a message."""
     if (missing := re.search(r'included file "(.+?)" not found', error)) is not None:
         folder = scene.resolve().parent / Path(missing[1]).parent
         available = sorted(path.stem for path in folder.glob("*.xml"))
         return f"; {Path(missing[1]).parent} holds {', '.join(available) or 'none'}"
     if (missing := re.search(r"undefined parameter: \$(\w+)", error)) is not None:
-        return f"; set it by -D {missing[1]}=…"
+        others = set(parameters) - set(re.findall(r"\$(\w+)", scene.read_text(encoding="utf-8", errors="replace")))
+        return f"; set it by -D {missing[1]}=…" + (f" instead of {', '.join(sorted(others))}" if others else "")
     if (missing := re.search(r'Plugin "(\w+)" not found', error)) is not None:
         return did_you_mean(missing[1], _PLUGINS)
     if "unused parameters" in error:

@@ -248,8 +248,7 @@ def draw_tracks(
     return HeightField(
         heights * depth,
         (size[0] / columns, size[1] / rows),
-        f"{name}, {tracks} tracks of {period:g} µm along x, pits {width:g} µm wide and {depth:g} µm deep seen through "
-        f"seed {seed}",
+        f"{name}, {tracks} tracks of {period:g} µm along x, pits {width:g} µm wide and {depth:g} µm deep, seed {seed}",
     )
 
 

@@ -78,12 +78,20 @@ def page(surface: Surface, *others: Surface, picture: NDArray[np.float16] | None
         if (size := around + len(data[-1].encode())) > MAX_PAGE_BYTES:
             raise RequestError(
                 f"{one.name}: got a page of {size / 1e6:.3g} MB, wanted at most {MAX_PAGE_BYTES / 1e6:g}; a larger "
-                "tolerance or a shorter coherence length makes its table smaller"
+                f"tolerance or a shorter coherence length makes its table smaller"
+                + _suggestion(one, (MAX_PAGE_BYTES - around) / (size - around))
             )
     tags = (f'<script id="data{i or ""}" type="application/json">{one}</script>' for i, one in enumerate(data))
     parts |= {"data": "\n".join(tags), "names": _json(names)}
     # In one pass, as a part may hold what looks like the name of another.
     return re.sub(r"\{\{(\w+)\}\}", lambda match: parts[match[1]], text)
+
+
+def _suggestion(surface: Surface, factor: float) -> str:
+    """Return an option that makes the table of a sample smaller by a factor, as the end of a message, or ""."""
+    # The nodes of a sample lie as densely as its lobes are narrow, along both axes.
+    length = 0.9 * surface.spectrum.coherence_length * max(factor, 0) ** 0.5
+    return f": --coherence-length {length:.2g}" if surface.spectrum.extent == "sample" else ""
 
 
 def reference_picture(path: str | os.PathLike[str]) -> NDArray[np.float16]:

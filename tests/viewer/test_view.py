@@ -145,6 +145,13 @@ def test_a_large_page_is_refused(monkeypatch):
     monkeypatch.setattr(pages, "MAX_PAGE_BYTES", 100_000)
     with pytest.raises(ValueError, match=r"got a page of .* MB, wanted at most 0.1; a larger tolerance"):
         md.view("blazed", depth=0.02, samples=32, coherence_length=2.0)
+    # The coherence length that the message names is short enough.
+    scan = dict(parameters={"size": 16.0}, extent="sample", tolerance=0.05)
+    monkeypatch.setattr(pages, "MAX_PAGE_BYTES", 650_000)
+    with pytest.raises(ValueError, match=r"table smaller: --coherence-length \d") as refused:
+        md.view(md.Recipe.of_profile("elaphe_synthetic", coherence_length=8.0, **scan))
+    length = float(str(refused.value).rpartition(" ")[2])
+    md.view(md.Recipe.of_profile("elaphe_synthetic", coherence_length=length, **scan))
 
 
 def test_a_notebook_shows_the_page_in_a_frame():

@@ -47,7 +47,7 @@ NOISE_COLUMNS = {
     "noise² × time\non gratings": "{.on_gratings_at_equal_time:.2f}",
     "noise² × time\nof the picture": "{.of_picture_at_equal_time:.2f}",
 }
-BOUND_COLUMNS = {
+BOUNDS_COLUMNS = {
     "scene": "{.scene}",
     "perfect\nsampling": "{.perfect:.2f}",
     "beside\nroughconductor": "{.perfect_beside_roughconductor:.2f}",

@@ -93,12 +93,12 @@ def _measure_terms(json: Path | None, plot: Path | None) -> None:
 
 def _measure_noise(json: Path | None) -> None:
     from .. import report
-    from ..benchmark.noise import BOUND_COLUMNS, NOISE_COLUMNS, measure_noise
+    from ..benchmark.noise import BOUNDS_COLUMNS, NOISE_COLUMNS, measure_noise
     from ..benchmark.speed import machine
 
     with progress_bar("noise of pictures") as progress:
         noise, bounds = measure_noise(progress=progress)
-    for columns, rows in ((NOISE_COLUMNS, noise), (BOUND_COLUMNS, bounds)):
+    for columns, rows in ((NOISE_COLUMNS, noise), (BOUNDS_COLUMNS, bounds)):
         show(table(columns, (report.cells(columns, row) for row in rows)), width=110)
     if json is not None:
         outputs.save_json({"machine": machine(), "noise": noise, "bounds": bounds}, json)

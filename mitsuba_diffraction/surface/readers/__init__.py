@@ -134,7 +134,7 @@ def read_height_field(
             if pixel_size is None and scan.pixel_size is None and height_range is None and integers:
                 raise RequestError(
                     f"pixel_size, height_range: both missing for {scan.numbers.dtype} heights, wanted one number or "
-                    "(x, y) in µm, and the height in µm from black to white"
+                    "(x, y) in µm, and the height in µm from black to white (--pixel-size, --height-range)"
                 )
             heights = _as_micrometres(scan.numbers, height_range)
         if not (fill_missing or keep_missing) and scan.numbers.dtype.kind in "iu" and np.ma.is_masked(scan.numbers):
