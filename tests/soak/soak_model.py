@@ -266,7 +266,9 @@ class Model:
         for omega in (wi, wo):
             cos = omega[:, 2]
             if c.coat:
-                cos = np.sqrt(1 - (1 - cos**2) * (c.outside / self.above(wavelength)) ** 2)
+                # Films under a coat with dispersion have the phase of light in its nominal index.
+                inside = self.above(NOMINAL if isinstance(c.coat, Cauchy) else wavelength)
+                cos = np.sqrt(1 - (1 - cos**2) * (c.outside / inside) ** 2)
             result = result * self.of_plane(cos, True, wavelength, at)[1]
         return result * c.base / np.pi
 
