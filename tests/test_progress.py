@@ -37,7 +37,7 @@ def test_progress_begins_with_the_heights_and_never_decreases():
     done, total = zip(*reports, strict=True)
     assert set(total) == {100}
     assert list(done) == sorted(done)
-    assert done[0] <= 20
+    assert done[0] < 50  # the part of the heights
     assert done[-1] == 100
 
 

@@ -85,6 +85,7 @@ def test_pixels_that_cannot_be_are_named(luminance, message, caplog):
     assert re.search(message, caplog.text)
 
 
+@pytest.mark.slow
 def test_a_black_picture_says_so(llvm, tmp_path, caplog):
     """Blender's default scene, a cube and a point light, with metal on it: no facet mirrors the lamp."""
     lamp = '<emitter type="point"><point name="position" x="9" y="0" z="0"/></emitter>'

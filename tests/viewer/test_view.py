@@ -145,7 +145,10 @@ def test_a_large_page_is_refused(monkeypatch):
     monkeypatch.setattr(pages, "MAX_PAGE_BYTES", 100_000)
     with pytest.raises(ValueError, match=r"got a page of .* MB, wanted at most 0.1; a larger tolerance"):
         md.view("blazed", depth=0.02, samples=32, coherence_length=2.0)
-    # The coherence length that the message names is short enough.
+
+
+@pytest.mark.slow
+def test_the_coherence_length_that_a_refusal_names_is_short_enough(monkeypatch):
     scan = dict(parameters={"size": 16.0}, extent="sample", tolerance=0.05)
     monkeypatch.setattr(pages, "MAX_PAGE_BYTES", 650_000)
     with pytest.raises(ValueError, match=r"table smaller: --coherence-length \d") as refused:
