@@ -32,6 +32,7 @@ SURFACES: dict[str, dict[str, float | str]] = {
     "blazed": {"period": 1.7, "depth": 0.31},
     "crossed": {"period": 2.3, "depth": 0.21},
     "compact_disc": {"period": 1.5, "depth": 0.12},
+    "foil": {"depth": 0.7},
     "xenopeltis_synthetic": {"depth": 0.4},
     "film": {"depth": 0.7, "transmission": "sheet", "int_ior": 1.5},
 }
