@@ -85,8 +85,10 @@ def test_scene_of_transmitted_light_renders(llvm, name, parameters):
 def test_scene_of_a_scan_renders(llvm, tmp_path):
     path = tmp_path / "spectrum.exr"
     md.precompute(md.gratings.elaphe_synthetic(8)).save(path)
-    for name, parameter in (("scan", "spectrum"), ("elaphe", "skin")):
-        check(render(SCENES / f"{name}.xml", spp=4, width=16, height=16, parameters={parameter: str(path)}), 16, 16)
+    recipe = tmp_path / "skin.toml"
+    recipe.write_text('[surface]\nprofile = "elaphe_synthetic"\nsize = 8.0\n')
+    for name, parameters in (("scan", {"spectrum": str(path)}), ("elaphe", {"skin": str(recipe)})):
+        check(render(SCENES / f"{name}.xml", spp=4, width=16, height=16, parameters=parameters), 16, 16)
 
 
 ON_ONE_CORE = """
