@@ -76,15 +76,19 @@ def _alternatives(scene: Path, error: str, parameters: Mapping[str, str]) -> str
         available = sorted(path.stem for path in folder.glob("*.xml"))
         return f"; {Path(missing[1]).parent} holds {', '.join(available) or 'none'}"
     if (missing := re.search(r"undefined parameter: \$(\w+)", error)) is not None:
-        others = set(parameters) - set(re.findall(r"\$(\w+)", scene.read_text(encoding="utf-8", errors="replace")))
-        return f"; set it by -D {missing[1]}=…" + (f" instead of {', '.join(sorted(others))}" if others else "")
+        unknown = sorted(set(parameters) - _parameters_of(scene))
+        return f"; set it by -D {missing[1]}=…" + (f" instead of {', '.join(unknown)}" if unknown else "")
     if (missing := re.search(r'Plugin "(\w+)" not found', error)) is not None:
         return did_you_mean(missing[1], _PLUGINS)
     if "unused parameters" in error:
-        text = scene.read_text(encoding="utf-8", errors="replace")
-        known = sorted({*re.findall(r"\$(\w+)", text), *re.findall(r'<default\s+name="(\w+)"', text)})
-        return f"; the scene's parameters are {', '.join(known) or 'none'}"
+        return f"; the scene's parameters are {', '.join(sorted(_parameters_of(scene))) or 'none'}"
     return ""
+
+
+def _parameters_of(scene: Path) -> set[str]:
+    """Return the names of the parameters that a scene uses or has defaults for."""
+    text = scene.read_text(encoding="utf-8", errors="replace")
+    return {*re.findall(r"\$(\w+)", text), *re.findall(r'<default\s+name="(\w+)"', text)}
 
 
 def files_of_scene(

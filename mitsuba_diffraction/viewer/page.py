@@ -78,7 +78,7 @@ def page(surface: Surface, *others: Surface, picture: NDArray[np.float16] | None
         if (size := around + len(data[-1].encode())) > MAX_PAGE_BYTES:
             raise RequestError(
                 f"{one.name}: got a page of {size / 1e6:.3g} MB, wanted at most {MAX_PAGE_BYTES / 1e6:g}; a larger "
-                f"tolerance or a shorter coherence length makes its table smaller"
+                "tolerance or a shorter coherence length makes its table smaller"
                 + _suggestion(one, (MAX_PAGE_BYTES - around) / (size - around))
             )
     tags = (f'<script id="data{i or ""}" type="application/json">{one}</script>' for i, one in enumerate(data))

@@ -65,9 +65,12 @@ def test_perfect_sampling_has_the_density_of_f_cos(surface, llvm):
     wi, wavelengths = np.broadcast_to([0.6, 0, 0.8], (20000, 3)), [550.0] * 4
     wo, own, _ = sample(bsdf, wi, wavelengths)
     sample_perfectly(scene)
-    _, perfect, _ = sample(bsdf, wi, wavelengths)
+    drawn, perfect, _ = sample(bsdf, wi, wavelengths)
     assert perfect[:, 0].mean() == pytest.approx(own[:, 0].mean(), rel=0.02)
     assert perfect[:, 0].std() < own[:, 0].std() / 2
+    # ∫ f cos x² dω: the directions are drawn as their weights say.
+    moments = [np.mean(weight[:, 0] * omega[:, 0] ** 2) for omega, weight in ((wo, own), (drawn, perfect))]
+    assert moments[1] == pytest.approx(moments[0], rel=0.03)
     value, pdf = evaluate_pdf(bsdf, wi, wo, wavelengths)
     rough = value[:, 0] > 0  # not the mirror image in the coat
     # R is estimated anew for each direction.
