@@ -70,6 +70,7 @@ def test_the_wheel_is_used_by_default() -> None:
     assert not run(IMPORT, USE).stderr
 
 
+@pytest.mark.slow
 @pytest.mark.few(1)
 @needs_wheel
 @pytest.mark.parametrize("first", ["import drjit", "import mitsuba"])

@@ -77,6 +77,7 @@ def test_bytes_are_written_without_powers_of_ten(count, text):
     assert progress.bytes_text(count) == text
 
 
+@pytest.mark.slow
 def test_a_notebook_shows_a_line():
     source = """
 from mitsuba_diffraction import progress

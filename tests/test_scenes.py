@@ -103,6 +103,7 @@ print(mi.traverse(mi.load_dict({"type": "bitmap", "filename": "texture.exr"}))["
 """
 
 
+@pytest.mark.slow
 @pytest.mark.skipif(not hasattr(os, "sched_setaffinity"), reason="the system cannot confine a process to one core")
 def test_a_picture_is_a_texture_on_one_core(llvm, tmp_path):
     program = [sys.executable, "-c", ON_ONE_CORE]
@@ -431,6 +432,7 @@ def test_models_are_the_same_each_time(tmp_path):
     assert len(files[0]) == 8
 
 
+@pytest.mark.slow
 def test_the_small_models_are_those_of_the_script(tmp_path):
     snake.small(tmp_path)
     names = sorted(path.name for path in tmp_path.iterdir())

@@ -195,9 +195,10 @@ def test_a_wrong_coat_is_refused(llvm, parameters, text):
             marks=pytest.mark.slow,
         ),
         # A layer of the index of water on a metal in water.
-        (
+        pytest.param(
             {"coat_ior": 1.33, "ext_ior": 1.33, "material": "Al"},
             {"coat_ior": 1.3314, "ext_ior": 1.33, "material": "Al"},
+            marks=pytest.mark.slow,
         ),
     ],
 )

@@ -93,7 +93,7 @@ def case(name):
     return {**SHALLOW, **FIVE_MICROMETRES}[name]
 
 
-@pytest.mark.few(14)
+@pytest.mark.few(7)
 @pytest.mark.parametrize("name", [*SHALLOW, *FIVE_MICROMETRES])
 def test_hard_surfaces_are_right_to_the_tolerance(name):
     field, extent, coherence_length = case(name)
@@ -295,6 +295,7 @@ def test_extreme_wavelengths_are_right_and_others_are_black(extent):
     assert (got[:, 2:] == 0).all()
 
 
+@pytest.mark.slow
 @pytest.mark.usefixtures("llvm")
 def test_five_micrometres_are_rendered_with_bessel_orders():
     spectrum = md.precompute(md.gratings.sinusoidal(2.5, 5.0))

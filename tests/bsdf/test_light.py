@@ -52,6 +52,7 @@ def test_a_spectrum_for_shorter_wavelengths_holds_for_longer_ones(llvm, coat):
     np.testing.assert_allclose(found, wanted, rtol=0.01)
 
 
+@pytest.mark.slow
 def test_a_lower_index_is_not_black(llvm):
     # Regression: lowered from 2.4 to 1.5, nothing was transmitted above 530 nm.
     grating = {**GRATING, "transmission": "interface", "conserve_energy": False}
@@ -63,6 +64,7 @@ def test_a_lower_index_is_not_black(llvm):
     np.testing.assert_allclose(*values, rtol=0.02)
 
 
+@pytest.mark.slow
 def test_a_film_of_infrared_or_ultraviolet_light_is_not_black(llvm):
     # Regression: near infrared light was black, without a word.
     flat = {**GRATING, "depth": 0.05, "material": "none"}
@@ -224,7 +226,11 @@ def flat(coherence_length):
 
 @pytest.mark.parametrize(
     ("coherence_length", "film", "light"),
-    [(0.1, None, 360), pytest.param(0.8, None, 830, marks=pytest.mark.slow), (0.8, (400, 900), 900)],
+    [
+        (0.1, None, 360),
+        pytest.param(0.8, None, 830, marks=pytest.mark.slow),
+        pytest.param(0.8, (400, 900), 900, marks=pytest.mark.slow),
+    ],
 )
 def test_a_window_shorter_than_the_wavelength_is_refused(llvm, coherence_length, film, light):
     # Regression: of a coherence length of 0.1 µm, a flat mirror reflected 0.05 to 0.25.

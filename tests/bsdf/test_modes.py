@@ -90,7 +90,7 @@ def in_bins(omega, *terms):
 
 
 @pytest.mark.filterwarnings("ignore:pixels of")
-@pytest.mark.few(10)
+@pytest.mark.few(6)
 @pytest.mark.parametrize(("surface", "mode"), PAIRS)
 def test_samples_have_their_density_and_average_to_the_integral_in_every_bin(llvm, surface, mode):
     bsdf, wavelengths = grating(surface, mode)

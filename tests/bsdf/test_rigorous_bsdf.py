@@ -109,7 +109,7 @@ def test_the_bsdf_is_reciprocal(llvm, spectrum):
     np.testing.assert_allclose(there, back, rtol=1e-4, atol=1e-6 * there.max())
 
 
-@pytest.mark.few(6)
+@pytest.mark.few(3)
 @pytest.mark.parametrize("theta", [0, 40, 75, 88])
 def test_samples_have_even_weights_that_average_to_the_efficiencies(llvm, spectrum, theta):
     wi = direction(theta, 30)

@@ -204,7 +204,7 @@ def effective_fraction(bsdf, theta, phi, draws, count):
     return np.mean(fractions), largest
 
 
-@pytest.mark.few(2)
+@pytest.mark.few(1)
 @pytest.mark.parametrize("phi", [0, 30, *(pytest.param(x, marks=pytest.mark.slow) for x in (60, 90, 180, 210, 300))])
 @pytest.mark.parametrize(
     ("theta", "least"),
@@ -345,6 +345,7 @@ def test_no_wavelength_is_sampled_outside_of_its_lobe(llvm, theta):
     np.testing.assert_array_less(np.abs(weight.mean(1) - wanted), 4 * error + 2e-3 * wanted)
 
 
+@pytest.mark.slow
 def test_orders_are_drawn_where_their_lobes_are_narrow_and_apart(llvm):
     elaphe = md.precompute(SMALL["elaphe"](), coherence_length=26.0)
     for of, sampler in ((elaphe, BinSampler), (blurred("blazed"), BinSampler), (bundled("blazed"), OrderSampler)):

@@ -65,7 +65,7 @@ LINE = [(m, 0) for m in range(-6, 7)]
 SQUARE = [(m, n) for m in range(-4, 5) for n in range(-4, 5)]
 
 
-@pytest.mark.few(3)
+@pytest.mark.few(1)
 @pytest.mark.parametrize(("lateral", "heights"), [(1.4, 0.8), (0.6, 1.3)])
 @pytest.mark.parametrize(
     ("surface", "orders", "parameters"),
@@ -290,6 +290,7 @@ def test_the_albedo_is_at_most_one_at_random_scales(llvm, name, pairs):
     assert np.mean(found) > 0.7
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", ["sinusoidal", pytest.param("foil", marks=pytest.mark.slow)])
 def test_e_of_few_scales_is_that_of_separate_gratings(llvm, name):
     """E of each of three pitches is that of a grating built with that pitch."""

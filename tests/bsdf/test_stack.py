@@ -282,6 +282,7 @@ def test_a_medium_with_dispersion_is_a_constant_one_at_each_wavelength(llvm, tra
         assert wanted.max() > 0.01
 
 
+@pytest.mark.few(1)
 @pytest.mark.parametrize(
     "parameters",
     [
@@ -311,6 +312,7 @@ def test_samples_of_a_medium_with_dispersion_have_their_density(llvm, parameters
         assert (weight.mean(0) < 2).mean() > 0.999
 
 
+@pytest.mark.slow
 def test_the_angle_of_a_transmitted_order_follows_the_index(llvm):
     """The grating equation with n(λ): sin θ_i = n sin θ_t + m λ/T."""
     bsdf = mi.load_dict(

@@ -103,7 +103,7 @@ def power_of_order(bsdf, kind, wi, wo):
     return (value / np.maximum(n**2 * abs(omega[2]), 1e-6) * (z > 0)).sum() * (step[1] - step[0]) ** 2
 
 
-@pytest.mark.few(2)
+@pytest.mark.few(1)
 @pytest.mark.parametrize("kind", KINDS)
 @pytest.mark.parametrize(("profile", "depth"), [("sinusoidal", 0.5), ("blazed", 0.5), ("blazed", 0.8)])
 @pytest.mark.parametrize(("theta", "phi"), [(0, 0), (25, 40), (50, 200)])
@@ -120,7 +120,7 @@ def test_orders_have_the_powers_of_the_closed_form(kind, profile, depth, theta, 
         assert np.abs(np.subtract(found, wanted)).sum() < 0.005 * max(1, np.sum(wanted))
 
 
-@pytest.mark.few(2)
+@pytest.mark.few(1)
 @pytest.mark.parametrize("kind", KINDS)
 @pytest.mark.parametrize("profile", ["sinusoidal", "blazed"])
 def test_transmission_is_reciprocal(kind, profile):
@@ -152,6 +152,7 @@ def test_transmission_is_reciprocal(kind, profile):
     np.testing.assert_allclose(radiance, there * abs(wo[:, 2]) * n_i**2, rtol=1e-5, atol=1e-5 * radiance.max())
 
 
+@pytest.mark.slow
 def test_a_sheet_is_reciprocal_where_facets_are_grazed():
     # Regression: 1 − F of light that facets nearly reflect totally had other rounding errors in the reversed pair.
     bsdf = transmitting("sheet", "sinusoidal", int_ior=2.4, coherence_length=2.0, conserve_energy=False)
@@ -173,6 +174,7 @@ def test_samples_follow_the_density_on_both_sides(kind, side, component):
     check_chi_square(bsdf, wi, wavelengths, ctx, cases=8, side=side if component == 0 else -side, ires=32)
 
 
+@pytest.mark.slow
 @pytest.mark.few(2)
 @pytest.mark.parametrize("kind", KINDS)
 @pytest.mark.parametrize("theta", [0, 40, 50, 75])
@@ -191,6 +193,7 @@ def test_sample_weights_have_a_small_variance(kind, theta, side):
     np.testing.assert_allclose(np.array(pdf)[glossy], np.array(bs.pdf)[glossy], rtol=1e-3)
 
 
+@pytest.mark.slow
 @pytest.mark.few(1)
 @pytest.mark.parametrize("theta", [75, 0, 40, 60])
 @pytest.mark.parametrize("profile", ["film", "transmission_300"])
@@ -208,7 +211,7 @@ def test_samples_from_above_have_similar_weights(profile, kind, theta):
     assert np.mean(fractions) > (0.4 if (profile, kind, theta) == ("transmission_300", "sheet", 75) else 0.5)
 
 
-@pytest.mark.few(2)
+@pytest.mark.few(1)
 @pytest.mark.parametrize("reflects", [False, True])
 @pytest.mark.parametrize("above", [False, True])
 @pytest.mark.parametrize("is_sheet", [False, True])
@@ -274,6 +277,7 @@ def changed_and_fresh(height_scale, eta):
     return changed, mi.load_dict({**scene, "height_scale": height_scale, "int_ior": eta})
 
 
+@pytest.mark.slow
 @pytest.mark.few(1)
 @pytest.mark.parametrize("eta", [1.25, 1.75])
 def test_an_index_that_changes_has_its_own_e_and_orders(eta):
@@ -308,6 +312,7 @@ def test_other_parameters_leave_tables_of_varying_scales(monkeypatch):
     parameters.update()
 
 
+@pytest.mark.slow
 def test_bins_in_which_no_order_propagates_are_empty():
     """Inside glass, beyond the critical angle of all orders of a fine grating: 0/0 was no probability."""
     bsdf = transmitting("interface", depth=1.0, lateral_scale=0.1, conserve_energy=False)

@@ -188,6 +188,7 @@ def test_precompute_writes_the_file_that_it_names_and_prints_its_error(command):
     assert f"{spectrum.unresolved_power:.1e} at frequencies that no direction reaches" in out
 
 
+@pytest.mark.slow
 def test_precompute_takes_a_sample_by_options(command):
     code, out, err = command(
         "precompute wide.npy --pixel-size 0.09 --extent sample --largest-angle 60 --tolerance 0.02 -o out.exr "
@@ -251,6 +252,7 @@ def test_missing_pixels_of_a_scan_are_filled_on_request(command):
     assert spectrum.source_digest == md.HeightField(np.load("holed.npy"), 0.05, fill_missing=True).digest
 
 
+@pytest.mark.slow
 def test_a_bare_scan_with_a_seam_wants_an_extent(command):
     x = np.arange(48) * 0.05
     np.save("whole.npy", 0.1 * np.sin(2 * np.pi * x / 0.8) + np.zeros((8, 1)))

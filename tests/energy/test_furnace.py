@@ -137,7 +137,7 @@ def order_albedo(of, omega, wavelength, steps=161):
     return total
 
 
-@pytest.mark.few(2)
+@pytest.mark.few(1)
 @pytest.mark.parametrize("depth", [0.25, 0.8])
 @pytest.mark.parametrize("coherence_length", [65.0, 20.0])
 def test_the_furnace_is_the_integral_over_the_lobes_of_orders(depth, coherence_length):

@@ -259,6 +259,7 @@ def test_only_pixels_covered_by_gratings_are_compared(llvm, tmp_path):
     assert disc - 2 * np.pi * radius < pictures.surface.sum() < disc
 
 
+@pytest.mark.slow
 @pytest.mark.few(1)
 @pytest.mark.parametrize("pigment", [True, False])
 def test_brightness_is_fitted_to_the_diffraction_of_this_model(llvm, tmp_path, pigment):

@@ -8,7 +8,13 @@ import pytest
 
 from mitsuba_diffraction.bsdf.base import gratings_in
 from mitsuba_diffraction.bsdf.testing import evaluate_pdf, sample
-from mitsuba_diffraction.evaluation.benchmark.noise import load_for_noise, measure_noise, relative_noise
+from mitsuba_diffraction.evaluation.benchmark.noise import (
+    _averaging,
+    _radiance,
+    load_for_noise,
+    measure_noise,
+    relative_noise,
+)
 from mitsuba_diffraction.evaluation.benchmark.perfect_sampling import sample_perfectly
 from mitsuba_diffraction.evaluation.benchmark.speed import machine
 
@@ -82,6 +88,17 @@ def test_a_skin_is_measured_beside_the_data_driven_bsdf_too(llvm):
     scene = BLAZE.with_name("xenopeltis.xml")
     found, _ = measure_noise([scene], depths=[2], width=16, samples=4, pictures=2)
     assert [one.beside for one in found] == ["roughconductor", "measured"]
+
+
+@pytest.mark.slow
+def test_many_samples_along_a_ray_have_the_light_of_one(llvm):
+    """In the sun, which `direct` would add once for each of many samples of the lights."""
+    scene = load_for_noise(BLAZE.with_name("foil.xml"), 48, None, type="direct")
+    one, many = (
+        _radiance(scene, integrator, 64, 1)
+        for integrator in (scene.integrator(), _averaging(mi.variant())(scene.integrator()))
+    )
+    assert many.mean() == pytest.approx(one.mean(), rel=0.03)
 
 
 def test_the_machine_is_named(llvm):

@@ -47,6 +47,7 @@ def test_the_emulated_shader_gives_the_published_map_of_the_blaze(llvm):
     assert agreement(pixels, mirrored).correlation < 0.9
 
 
+@pytest.mark.slow
 def test_the_emulated_shader_gives_the_published_map_of_elaphe_from_half_the_pixels(llvm):
     pixels = grid(ELAPHE, 20)
     heights = halved(ELAPHE.recipe.height_field())

@@ -60,6 +60,7 @@ def test_the_error_of_the_picture_falls_to_that_of_slices(llvm, tmp_path):
     assert np.abs(other - wanted).sum() / wanted.sum() == pytest.approx(mean[0], rel=0.2)
 
 
+@pytest.mark.slow
 def test_the_command_prints_a_row_for_each_number_of_terms(command, llvm, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     write(Path("scene.xml"), SUN, WITH_TERMS)

@@ -586,7 +586,7 @@ def viewing_cosines(built):
     return np.array(ray.d)[:2].reshape(2, 16, 16)
 
 
-@pytest.mark.few(3)
+@pytest.mark.few(1)
 @pytest.mark.parametrize("as_published", [True, False])
 @pytest.mark.parametrize("variant", ["flss", "nmm", "pq"])
 def test_bright_pixels_are_where_the_grating_equation_predicts(variant, as_published):

@@ -81,7 +81,7 @@ def above(bsdf, coherence_length):
     return scene(plate=plate(blaze(coherence_length, material="Al"), height=0.4), floor=floor, sun=SUN, sky=SKY)
 
 
-@pytest.mark.few(1)
+@pytest.mark.slow
 @pytest.mark.parametrize("name", BSDFS)
 def test_every_bsdf_of_mitsuba_converges_to_the_limit_of_path(name, llvm):
     assert_agree(above(BSDFS[name](), 1.5), 12, 1024)

@@ -107,6 +107,7 @@ def test_the_bsdf_sends_light_where_the_design_says(request_, llvm):
     assert max(correlations.values()) < 0.6
 
 
+@pytest.mark.few(2)
 @pytest.mark.parametrize("seen_on", ["wall", "screen"])
 @pytest.mark.parametrize("int_ior", [None, 1.5])
 def test_an_f_is_an_f_where_it_is_seen(seen_on, int_ior):
@@ -138,6 +139,7 @@ def test_an_f_is_an_f_where_it_is_seen(seen_on, int_ior):
         assert np.corrcoef(panel[::-1].mean(axis=-1).ravel(), expected.ravel())[0, 1] > 0.8
 
 
+@pytest.mark.slow
 @pytest.mark.not_quick
 def test_a_design_depends_on_its_seed_alone(laser):
     again = md.design(lopsided(), wavelengths=532, **SMALL)
@@ -146,6 +148,7 @@ def test_a_design_depends_on_its_seed_alone(laser):
     assert not np.array_equal(other.height_field.heights, laser.height_field.heights)
 
 
+@pytest.mark.slow
 @pytest.mark.not_quick
 def test_a_search_among_levels_beats_rounding(laser):
     stepped = md.design(lopsided(), wavelengths=532, levels=8, tool_blur=0, **SMALL)
@@ -157,6 +160,7 @@ def test_a_search_among_levels_beats_rounding(laser):
     assert stepped.efficiency[0] > 1.1 * rounded.efficiency[0]
 
 
+@pytest.mark.slow
 @pytest.mark.not_quick
 def test_the_time_and_the_memory_of_a_design_are_told_before_it(monkeypatch):
     told = []
@@ -179,6 +183,7 @@ def test_the_time_and_the_memory_of_a_design_are_told_before_it(monkeypatch):
     assert 0.3 * memory < peak < 1.5 * memory
 
 
+@pytest.mark.slow
 @pytest.mark.not_quick
 def test_a_prediction_has_no_lobe_of_every_order_in_memory():
     """16,000 orders over 801 bins would take 0.3 GB."""
@@ -287,6 +292,7 @@ def test_the_target_has_the_colours_of_the_picture_and_the_prediction_those_of_i
     assert design.colour_difference > 5
 
 
+@pytest.mark.few(2)
 @pytest.mark.parametrize(
     ("options", "words"),
     [

@@ -21,6 +21,7 @@ def design():
     return Design.of(heights, plate, wanted_fractions(np.eye(8), plate))
 
 
+@pytest.mark.slow
 @pytest.mark.not_quick
 def test_the_mesh_is_a_closed_solid(design, tmp_path):
     makers.save_stl(design.height_field, tmp_path / "a.stl")

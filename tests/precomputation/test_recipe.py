@@ -641,7 +641,7 @@ tolerance = 0.05
     ("line", "reads"),
     [
         pytest.param("precompute scan.npy --pixel-size 0.05 --tolerance 0.05", 1, marks=pytest.mark.slow),
-        ("precompute scan.toml", 1),
+        pytest.param("precompute scan.toml", 1, marks=pytest.mark.slow),
         ("inspect scan.toml", 1),
         ("render scene.xml --spp 1 --width 4 --overwrite", 1),
         ("render scene.xml --spp 1 --width 4 --overwrite", 0),  # from the cache

@@ -269,6 +269,7 @@ def test_what_a_rendering_needs_is_announced_after_two_bands(three_bands, small_
     assert estimate.seconds == 160  # for 16 more
 
 
+@pytest.mark.slow
 def test_an_estimate_is_corrected_after_a_tenth_of_the_work(small_passes, monkeypatch):
     """The second pass takes 10 s, all later ones 30 s: a sky above a snake."""
     small_passes(11)

@@ -70,6 +70,7 @@ def with_light_from_gratings(scene):
     return scene.replace('"path"', '"diffraction_path"').replace("</scene>", f'{sun}<shape type="rectangle"/></scene>')
 
 
+@pytest.mark.slow
 @pytest.mark.few(1)
 @pytest.mark.parametrize("scene", [SCENE, with_light_from_gratings(SCENE)], ids=["path", "diffraction_path"])
 @pytest.mark.parametrize("processes", [1, 2], indirect=True)

@@ -66,6 +66,7 @@ def test_the_table_has_the_efficiencies_of_the_solver(spectrum):
     assert spectrum.error <= 0.2
 
 
+@pytest.mark.slow
 def test_the_table_is_reciprocal(spectrum):
     c, g = np.random.default_rng(2).random((2, 100)) * [[0.3], [0.75]]
     for m in (-1, 0, 1):
@@ -119,6 +120,7 @@ def glass(request):
     return coarse((6, 10, 6), replace(REQUEST, polarised=True, transmission=request.param))
 
 
+@pytest.mark.slow
 def test_a_table_with_transmission_is_unchanged_by_saving_and_loading(glass, tmp_path):
     glass.save(tmp_path / "glass.exr")
     loaded = RigorousSpectrum.load(tmp_path / "glass.exr")
@@ -319,6 +321,7 @@ def test_the_work_of_a_job_is_the_number_of_its_eigenproblems(transmission, monk
     assert max(work) >= 5 * min(each for each in work if each)
 
 
+@pytest.mark.slow
 @pytest.mark.not_quick
 @pytest.mark.filterwarnings("ignore:rigorous table")  # of few steps
 def test_a_build_succeeds_without_a_usable_checkpoint(tmp_path, monkeypatch):

@@ -58,6 +58,7 @@ def phase_of_first_pixel(vector, relief):
     return np.exp(1j * WAVENUMBER * np.dot(vector[:2], relief.pixel_size) / 2)
 
 
+@pytest.mark.few(3)
 @pytest.mark.parametrize("order", ORDERS)
 def test_the_integral_over_the_surface_is_along_u_v_w(order):
     """I = (u, v, w) P/w (eq. 2.14): by parts, the integral over the normals is that of the phase alone."""

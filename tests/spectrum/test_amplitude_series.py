@@ -74,6 +74,7 @@ def test_weights_are_those_of_the_taylor_and_jacobi_anger_series():
     np.testing.assert_allclose(AmplitudeTable("chebyshev", 20.0, height, terms).weights(kappa), wanted, atol=1e-7)
 
 
+@pytest.mark.few(1)
 @pytest.mark.not_quick
 @EACH
 @given(terms=st.integers(1, 25), depth=st.sampled_from([0.05, 0.15, 0.3]), seed=st.integers(0, 99))

@@ -89,7 +89,7 @@ def surfaces(draw, depths):
 
 
 @pytest.mark.not_quick
-@settings(max_examples=max(5, settings.default.max_examples // 3))
+@settings(max_examples=max(5, settings.default.max_examples // 6))
 @given(
     field=surfaces([0.0, 0.02, 0.3, 1.0, 5.0]),
     tolerance=st.sampled_from(TOLERANCES),
@@ -113,7 +113,7 @@ def test_measured_skins_keep_the_tolerance(scan, name, tolerance):
     assert max_error(spectrum, field, random_kappas(6, 4)) <= tolerance
 
 
-@pytest.mark.few(3)
+@pytest.mark.few(2)
 @pytest.mark.parametrize(
     ("field", "tolerance"),
     [
@@ -194,7 +194,7 @@ def error_where_light_reaches(spectrum, field, kappa, max_q, coherence_length):
     return np.abs(along_x - lobes @ eta[0]).sum() * step
 
 
-@pytest.mark.few(4)
+@pytest.mark.few(2)
 @pytest.mark.parametrize("tolerance", [1e-2, 1e-3])
 @pytest.mark.parametrize(
     ("period", "coherence_length", "largest_angle"),
@@ -272,6 +272,7 @@ def test_the_axes_are_not_exchanged():
 # ---------------------------------------------------------------- depth
 
 
+@pytest.mark.few(1)
 @pytest.mark.parametrize("depth", [1.0, 5.0])
 def test_deep_surfaces_keep_the_tolerance(depth):
     spectrum = precompute(md.gratings.sinusoidal(2.5, depth))

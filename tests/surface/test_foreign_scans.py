@@ -126,6 +126,7 @@ def test_a_cut_text_of_an_interferometer_gives_heights_or_one_line(name, write, 
         assert "\n" not in str(caught.value)
 
 
+@pytest.mark.slow
 @needs_the_extra
 def test_an_igor_wave_without_units_is_read_with_those_given(tmp_path):
     path = tmp_path / "scan.ibw"

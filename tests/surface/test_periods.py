@@ -372,6 +372,7 @@ def test_crops_confirm_the_uncertainty_of_the_fingers(panel):
             assert abs(one.period - other.period) < 2.5 * np.hypot(one.period_uncertainty, other.period_uncertainty)
 
 
+@pytest.mark.slow
 @pytest.mark.not_quick
 @pytest.mark.few(1)
 @pytest.mark.parametrize(

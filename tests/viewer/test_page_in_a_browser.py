@@ -102,7 +102,9 @@ def pairs_of(spectrum, count=10_000, seed=1):
         pytest.param("elaphe_afm.toml", {"material": "Ag", "coat_ior": 1.5}, {}, marks=pytest.mark.slow),
         pytest.param("compact_disc.toml", {}, {}, marks=pytest.mark.slow),
         pytest.param("foil_crossed.toml", {"material": "none"}, {}, marks=pytest.mark.slow),
-        ("elaphe_afm.toml", {"int_ior": 1.5}, {"hasBase": True, "pigment": "#7c3f95"}),
+        pytest.param(
+            "elaphe_afm.toml", {"int_ior": 1.5}, {"hasBase": True, "pigment": "#7c3f95"}, marks=pytest.mark.slow
+        ),
         pytest.param("elaphe.toml", {"int_ior": 1.7}, {}, marks=pytest.mark.slow),
         pytest.param("xenopeltis.toml", {}, {}, marks=pytest.mark.slow),
     ],
@@ -227,6 +229,7 @@ def test_a_drag_changes_the_picture_and_nothing_leaves_the_page(opened):
     assert saved.value.suggested_filename == "blazed.png"
 
 
+@pytest.mark.slow
 def test_the_scene_of_a_view_has_file_names_without_folders(opened):
     surface = Surface.named(RECIPES / "blaze.toml", {"material": "Al"})
     tab = opened(surface)
@@ -256,6 +259,7 @@ def test_a_slider_sets_the_brightness_of_the_shader(opened):
     assert slider.is_disabled()
 
 
+@pytest.mark.slow
 def test_a_pixel_has_the_orders_of_the_grating_equation(opened):
     tab = opened(Surface.named("blazed", {"period": 2.5, "depth": 0.25, "material": "none"}))
     # The light is 24 degrees from the axis of the camera, in the plane across the grooves.
@@ -283,6 +287,7 @@ def test_a_pixel_has_the_orders_of_the_grating_equation(opened):
     assert re.fullmatch(r"f cos θ up to [\d.e+]+ sr⁻¹", labels[-2])
 
 
+@pytest.mark.slow
 def test_a_colour_is_not_said_to_be_nothing(opened):
     """At a pixel that only the sky lights, and at one that is black."""
     tab = opened(Surface.named("blazed", {"period": 2.5, "depth": 0.25, "material": "none"}))
@@ -300,6 +305,7 @@ def test_a_colour_is_not_said_to_be_nothing(opened):
     assert "Nothing is diffracted from this light to the eye." in remarks[1]
 
 
+@pytest.mark.slow
 def test_what_is_shown_first_is_complete(opened):
     """The bands of a slow first frame are not shown: a smaller picture stands there until the frame is complete."""
     tab = opened(Surface.named("blazed", {"depth": 0.1, "samples": 64, "coherence_length": 3.0}))
@@ -332,6 +338,7 @@ def test_what_is_shown_first_is_complete(opened):
     assert all(max(low, high) < 180 for *_, low, high in seen)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "orientation",
     [pytest.param(30, marks=pytest.mark.slow), "radial", pytest.param("tangential", marks=pytest.mark.slow)],
@@ -377,6 +384,7 @@ def blaze():
     return Surface.named("blazed", {"depth": 0.1, "samples": 64, "coherence_length": 3.0})
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("skin", ["xenopeltis", pytest.param("elaphe", marks=pytest.mark.slow)])
 def test_the_coil_has_the_scales_of_the_scene(skin, blaze, opened, llvm):
     """Normals and tangents at each pixel of the coil against the textures of the scene of the view."""
@@ -434,6 +442,7 @@ def test_the_coil_has_the_scales_of_the_scene(skin, blaze, opened, llvm):
     assert np.median(np.abs(turned)) == pytest.approx(np.median(np.abs(wanted)), rel=0.15)
 
 
+@pytest.mark.slow
 def test_scales_take_as_much_light_as_a_normal_map(blaze, opened, llvm):
     """The shadows of a relief, against a white surface under Mitsuba's normal map."""
     tab = opened(blaze)
@@ -519,6 +528,7 @@ def disc():
     return Surface.named("compact_disc", small)
 
 
+@pytest.mark.slow
 def test_a_disc_has_a_hole_and_clear_rings(disc, opened):
     tab = opened(disc)
     assert tab.evaluate("[viewer.state.shape, viewer.state.material, viewer.state.coat]") == ["disc", "Al", 1.55]
@@ -616,6 +626,7 @@ def test_a_designed_plate_opens_with_its_picture_on_a_wall(cat, opened, tmp_path
     assert np.corrcoef(*halves)[0, 1] > 0.3
 
 
+@pytest.mark.slow
 def test_a_reference_picture_is_compared(opened):
     surface = Surface.named("blazed", {"depth": 0.1, "samples": 64, "coherence_length": 3.0})
     grey = np.full((40, 40, 3), 0.5, np.float16)

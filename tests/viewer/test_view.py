@@ -202,6 +202,7 @@ def test_a_disc_opens_under_plastic_with_its_tracks_round_the_centre(source, com
         assert first == pytest.approx(46 / 120, rel=0.02)
 
 
+@pytest.mark.slow
 @pytest.mark.not_quick
 def test_several_surfaces_are_a_list_in_one_page(command, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)

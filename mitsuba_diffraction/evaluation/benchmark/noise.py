@@ -8,9 +8,11 @@ import tempfile
 import time
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import cache
 from pathlib import Path
 from typing import Any
 
+import drjit as dr
 import mitsuba as mi
 import numpy as np
 from numpy.typing import NDArray
@@ -100,9 +102,9 @@ class Noise:
 class Bounds:
     """Noise² of direct light on pixels that show gratings, by more work at each point that a ray hits.
 
-    All are relative to one sample of the BSDF and one of the lights, as `path` takes them. With n of each (Mitsuba's
-    `direct`), noise² is V_∞ + (V_1 − V_∞)/n; V_∞ remains if the light that a point reflects at the four wavelengths of
-    a ray is known exactly.
+    All are relative to one sample of the BSDF and one of the lights, as `path` takes them. With n of each, noise² is
+    V_∞ + (V_1 − V_∞)/n; V_∞ remains if the light that a point reflects at the four wavelengths of a ray is known
+    exactly.
 
     Attributes:
         scene: name of its file, without extension.
@@ -167,10 +169,10 @@ def measure_noise(
             progress(next(count), total)
         bounds = []
         for path in paths:
-            shadings = [(None, 1, 1), (None, 1, 1), (None, 1, _FOUR), (None, _MANY, _MANY), (rough, 1, 1)]
+            shadings = [(None, 1), (None, 1), (None, _FOUR), (None, 1), (rough, 1)]
             of_path = [
-                load_for_noise(path, width, other, type="direct", emitter_samples=lights, bsdf_samples=directions)
-                for other, lights, directions in shadings
+                load_for_noise(path, width, other, type="direct", bsdf_samples=directions)
+                for other, directions in shadings
             ]
             sample_perfectly(of_path[1])
             bounds.append(_bounds(path.stem, of_path, samples, pictures))
@@ -192,7 +194,9 @@ def _noise(name: str, beside: str, depth: int, pair: list[mi.Scene], samples: in
 
 def _bounds(name: str, scenes: list[mi.Scene], samples: int, pictures: int) -> Bounds:
     shown = shows_gratings(scenes[0])
-    times, radiance = _alternating(scenes, samples, pictures)
+    integrators = [scene.integrator() for scene in scenes]
+    integrators[3] = _averaging(mi.variant())(integrators[3])
+    times, radiance = _alternating(scenes, samples, pictures, integrators)
     one, perfect, four, many, rough = (
         relative_noise(kind, shown) for kind in spectrum_to_linear_sRGB(radiance, channel_wavelengths())
     )
@@ -201,14 +205,15 @@ def _bounds(name: str, scenes: list[mi.Scene], samples: int, pictures: int) -> B
 
 
 def _alternating(
-    scenes: Sequence[mi.Scene], samples: int, pictures: int
+    scenes: Sequence[mi.Scene], samples: int, pictures: int, integrators: Sequence[mi.SamplingIntegrator] = ()
 ) -> tuple[NDArray[np.float64], NDArray[np.float32]]:
     """Render pictures of scenes in turn: medians of seconds of processor time, and (scenes, pictures, …) radiance."""
     times, radiance = np.zeros((len(scenes), pictures)), []
+    integrators = integrators or [scene.integrator() for scene in scenes]
     for index in range(-1, pictures):  # the first compiles
-        for kind, scene in enumerate(scenes):
+        for kind, (scene, integrator) in enumerate(zip(scenes, integrators, strict=True)):
             begin = time.process_time()
-            picture = _radiance(scene, samples, index + 1)
+            picture = _radiance(scene, integrator, samples, index + 1)
             if index >= 0:
                 times[kind, index] = time.process_time() - begin
                 radiance.append(picture)
@@ -255,12 +260,43 @@ def _properties(values: dict[str, Any]) -> mi.Properties:
     return properties
 
 
-def _radiance(scene: mi.Scene, samples: int, seed: int) -> NDArray[np.float32]:
+def _radiance(scene: mi.Scene, integrator: mi.SamplingIntegrator, samples: int, seed: int) -> NDArray[np.float32]:
     """Return the radiance of a picture, (rows, columns, channels)."""
     columns, rows = scene.sensors()[0].film().crop_size()
     sums = Accumulation.empty(rows, columns)
-    sums.add(trace_pass(scene, samples, pass_seed(seed, 0)), samples)
+    sums.add(trace_pass(scene, samples, pass_seed(seed, 0), integrator), samples)
     return sums.radiance()
+
+
+@cache
+def _averaging(variant: str) -> type:
+    """Return the class of an integrator that averages `_MANY` samples of another one along each ray of the camera.
+
+    `direct` of Mitsuba 3.9.1 with many `emitter_samples` adds the light of each sample of a delta emitter in full.
+    """
+
+    class Averaged(mi.SamplingIntegrator):
+        def __init__(self, one: mi.SamplingIntegrator) -> None:
+            mi.SamplingIntegrator.__init__(self, mi.Properties("averaged"))
+            self.one = one
+
+        @dr.syntax
+        def sample(
+            self,
+            scene: mi.Scene,
+            sampler: mi.Sampler,
+            ray: mi.RayDifferential3f,
+            medium: mi.Medium | None = None,
+            active: mi.Bool = True,
+        ) -> tuple[mi.Spectrum, mi.Bool, list[mi.Float]]:
+            radiance, valid, number = mi.Spectrum(0), mi.Bool(False), mi.UInt32(0)
+            while number < _MANY:
+                value, valid, _ = self.one.sample(scene, sampler, ray, medium, active)
+                radiance += value
+                number += 1
+            return radiance / _MANY, valid, []
+
+    return Averaged
 
 
 def _draw_one_wavelength(scene: mi.Scene) -> None:
