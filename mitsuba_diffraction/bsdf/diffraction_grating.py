@@ -8,7 +8,7 @@ from collections.abc import Sequence
 
 import mitsuba as mi
 
-from ..errors import RequestError
+from ..errors import RequestError, did_you_mean
 from ..optics.materials import DISPERSION
 from ..plugin_parameters import Parameter, listed
 from ..precomputation.recipe import MAX_PATCHES, Recipe, parameters_of_profile
@@ -184,7 +184,8 @@ def refuse_wrong(props: mi.Properties) -> None:
     # `profile_name` refuses unknown profiles.
     known = {*types, *(parameters_of_profile(profile) if is_known else ())}
     if (profile is None or is_known) and (unknown := sorted(set(props.keys()) - known - nested)):
-        raise RequestError(f"{', '.join(unknown)}: unknown, wanted one of {', '.join(sorted(known))}")
+        similar = did_you_mean(unknown[0], known)
+        raise RequestError(f"{', '.join(unknown)}: unknown, wanted one of {', '.join(sorted(known))}{similar}")
     for name in props.keys():  # noqa: SIM118
         kind, wanted = props.type(name), types.get(name, "float or string")
         is_base = name in nested and ("BSDF" in wanted or name not in types)

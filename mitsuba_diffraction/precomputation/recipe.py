@@ -336,8 +336,9 @@ def theory_in(path: Path) -> str:
 
 def _refuse_unknown(where: str, table: Mapping[str, Any], known: frozenset[str]) -> None:
     if unknown := sorted(set(table) - known):
+        similar = did_you_mean(unknown[0], known)
         raise RequestError(
-            f"{where}: got the unknown name {', '.join(unknown)}, wanted among {', '.join(sorted(known))}"
+            f"{where}: got the unknown name {', '.join(unknown)}, wanted among {', '.join(sorted(known))}{similar}"
         )
 
 

@@ -9,7 +9,7 @@ from dataclasses import dataclass, fields, replace
 from pathlib import Path
 from typing import Any
 
-from ..errors import RequestError, is_number
+from ..errors import RequestError, did_you_mean, is_number
 from ..files.writing import examples_folder
 from ..optics.materials import refractive_index
 from ..precomputation.grating_spectrum import GratingSpectrum
@@ -225,8 +225,9 @@ def material_from(parameters: Mapping[str, Any], others: tuple[str, ...] = ()) -
         if name in _NOT_SHOWN:
             raise RequestError(f"{name}: got {value!r}, and the page shows {_NOT_SHOWN[name]}")
         if name not in known:
-            wanted = ", ".join((*sorted(known), *sorted(others)))
-            raise RequestError(f"{name}: got {value!r}, wanted a parameter among {wanted}")
+            names = (*sorted(known), *sorted(others))
+            similar = did_you_mean(name, names)
+            raise RequestError(f"{name}: got {value!r}, wanted a parameter among {', '.join(names)}{similar}")
     if "material" in parameters and "int_ior" in parameters:
         raise RequestError("material: a conductor or a perfect mirror takes no int_ior; give one or the other")
     return replace(ViewedMaterial(), **parameters)

@@ -235,7 +235,7 @@ def test_variant_without_wavelengths_is_refused():
 @pytest.mark.parametrize(
     ("parameters", "text"),
     [
-        ({"hight_scale": 1.0}, "hight_scale: unknown, wanted one of base, .*height_scale"),
+        ({"hight_scale": 1.0}, "hight_scale: unknown, wanted one of base, .*; did you mean height_scale"),
         ({"shadowing": "smith"}, "shadowing"),
         ({"fresnel": "exact"}, "fresnel"),
         ({"material": "none", "int_ior": 1.5}, "material"),
