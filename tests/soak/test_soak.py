@@ -22,7 +22,7 @@ pytestmark = [
     pytest.mark.filterwarnings("ignore:terms"),
     pytest.mark.filterwarnings("ignore:sample of"),
 ]
-FIXED_SEED, FIXED_EXAMPLES = 1, 1
+FIXED_SEED = 1
 EXAMPLES = 20  # of each seed of a long run
 SINUSOID = Surface("sinusoid", (2.5, 2.5), 0.3)
 CASES = {
@@ -86,10 +86,12 @@ def test_case(llvm, tmp_path, name):
     judge(CASES[name], tmp_path, ("value", "density"))
 
 
-def test_random_configurations(llvm, tmp_path, pytestconfig, capsys):
+@pytest.mark.parametrize("fixed", [1, pytest.param(4, marks=pytest.mark.slow)])
+def test_random_configurations(llvm, tmp_path, pytestconfig, capsys, fixed):
+    """The number of `fixed` configurations of a fixed seed, or random ones as the options say."""
     minutes, seed = pytestconfig.getoption("--soak"), pytestconfig.getoption("--soak-seed")
     if not minutes:
-        explore(*(FIXED_SEED, FIXED_EXAMPLES) if seed is None else (seed, EXAMPLES), tmp_path)
+        explore(*(FIXED_SEED, fixed) if seed is None else (seed, EXAMPLES), tmp_path)
         return
     start = report = time.monotonic()
     seed = time.time_ns() % 10**6 if seed is None else seed

@@ -89,7 +89,7 @@ def surfaces(draw, depths):
 
 
 @pytest.mark.not_quick
-@settings(max_examples=max(5, settings.default.max_examples // 6))
+@settings(max_examples=max(5, settings.default.max_examples // 3))
 @given(
     field=surfaces([0.0, 0.02, 0.3, 1.0, 5.0]),
     tolerance=st.sampled_from(TOLERANCES),

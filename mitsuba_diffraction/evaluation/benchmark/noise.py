@@ -169,7 +169,7 @@ def measure_noise(
             progress(next(count), total)
         bounds = []
         for path in paths:
-            shadings = [(None, 1), (None, 1), (None, _FOUR), (None, 1), (rough, 1)]
+            shadings = [(None, 1), (None, 1), (None, _FOUR), (rough, 1)]
             of_path = [
                 load_for_noise(path, width, other, type="direct", bsdf_samples=directions)
                 for other, directions in shadings
@@ -182,42 +182,45 @@ def measure_noise(
 
 def _noise(name: str, beside: str, depth: int, pair: list[mi.Scene], samples: int, pictures: int) -> Noise:
     shown = shows_gratings(pair[0])
-    times, radiance = _alternating(pair, samples, pictures)
+    times, radiance = _alternating(_as_they_are(pair), samples, pictures)
     grating, other = spectrum_to_linear_sRGB(radiance, channel_wavelengths())
     ratios = [relative_noise(grating, some) / relative_noise(other, some) for some in (shown, shown | True)]
     for scene in pair:
         _draw_one_wavelength(scene)
-    grating, other = _alternating(pair, samples, pictures)[1].sum(axis=-1, keepdims=True)
+    grating, other = _alternating(_as_they_are(pair), samples, pictures)[1].sum(axis=-1, keepdims=True)
     ratios.append(relative_noise(grating, shown) / relative_noise(other, shown))
     return Noise(name, beside, depth, times[0], times[0] / times[1], *ratios)
 
 
 def _bounds(name: str, scenes: list[mi.Scene], samples: int, pictures: int) -> Bounds:
     shown = shows_gratings(scenes[0])
-    integrators = [scene.integrator() for scene in scenes]
-    integrators[3] = _averaging(mi.variant())(integrators[3])
-    times, radiance = _alternating(scenes, samples, pictures, integrators)
-    one, perfect, four, many, rough = (
+    many_samples = scenes[0], _averaging(mi.variant())(scenes[0].integrator())
+    times, radiance = _alternating([*_as_they_are(scenes), many_samples], samples, pictures)
+    one, perfect, four, rough, many = (
         relative_noise(kind, shown) for kind in spectrum_to_linear_sRGB(radiance, channel_wavelengths())
     )
     rest = max((_MANY * many - one) / (_MANY - 1), 0.0)
     return Bounds(name, perfect / one, perfect / rough, times[2] / times[0], four / one, rest / one, rest / rough)
 
 
+def _as_they_are(scenes: Sequence[mi.Scene]) -> list[tuple[mi.Scene, mi.SamplingIntegrator]]:
+    """Return scenes with the integrators that they have."""
+    return [(scene, scene.integrator()) for scene in scenes]
+
+
 def _alternating(
-    scenes: Sequence[mi.Scene], samples: int, pictures: int, integrators: Sequence[mi.SamplingIntegrator] = ()
+    kinds: Sequence[tuple[mi.Scene, mi.SamplingIntegrator]], samples: int, pictures: int
 ) -> tuple[NDArray[np.float64], NDArray[np.float32]]:
-    """Render pictures of scenes in turn: medians of seconds of processor time, and (scenes, pictures, …) radiance."""
-    times, radiance = np.zeros((len(scenes), pictures)), []
-    integrators = integrators or [scene.integrator() for scene in scenes]
+    """Render pictures of all kinds in turn: medians of seconds of processor time, and (kinds, pictures, …) radiance."""
+    times, radiance = np.zeros((len(kinds), pictures)), []
     for index in range(-1, pictures):  # the first compiles
-        for kind, (scene, integrator) in enumerate(zip(scenes, integrators, strict=True)):
+        for kind, (scene, integrator) in enumerate(kinds):
             begin = time.process_time()
             picture = _radiance(scene, integrator, samples, index + 1)
             if index >= 0:
                 times[kind, index] = time.process_time() - begin
                 radiance.append(picture)
-    return np.median(times, axis=1), np.stack(radiance).reshape(pictures, len(scenes), *picture.shape).swapaxes(0, 1)
+    return np.median(times, axis=1), np.stack(radiance).reshape(pictures, len(kinds), *picture.shape).swapaxes(0, 1)
 
 
 def relative_noise(pictures: NDArray[np.float64], where: NDArray[np.bool_]) -> float:
