@@ -1,4 +1,4 @@
-"""Print the table of docs/speed.md: the kernels that Dr.Jit compiles for a first picture of a scene, and for others.
+"""Print a table, summarised in docs/speed.md: the kernels that Dr.Jit compiles for a first picture of a scene, and for others.
 
     python tools/manual/kernels.py [NAME …]
 
