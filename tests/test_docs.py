@@ -25,7 +25,7 @@ from mitsuba_diffraction.evaluation.realtime_shader.quirks import Quirks
 ROOT = Path(__file__).parents[1]
 PACKAGE = Path(md.__file__).parent
 PAGES = [ROOT / "README.md", *sorted((ROOT / "docs").glob("*.md"))]
-SLOW = {"compare", "design", "long_renders", "own_grating", "own_scan", "plugin", "reading_exr", "tolerance", "viewer"}
+SLOW = {"compare", "design", "long_renders", "own_grating", "own_scan", "plugin", "viewer"}
 """Pages whose code takes long."""
 BLOCK = re.compile(r"^(?P<indent> *)```(?P<language>\w+)\n(?P<body>.*?)^ *```$", re.DOTALL | re.MULTILINE)
 REDUCED = {
@@ -35,8 +35,8 @@ REDUCED = {
     "compare": {"--width": "16", "--spp": "1", "--no-shares": None},
 }
 """Options that make a command quick, instead of those that it has."""
-SHOWN = {"text", "bash"}
-"""What is shown and not run: output, and what needs several machines (tests/render/test_cluster.py)."""
+SHOWN = {"text", "bash", "math"}
+"""What is shown and not run: output, what needs several machines (tests/render/test_cluster.py), and formulas."""
 BY_OTHER_MEANS = (
     *("python3 -m venv", "python -m pytest", "pip install", "jupyter ", "mkdocs "),
     *("mitsuba-diffraction benchmark", "mitsuba-diffraction convergence", "mitsuba-diffraction validate"),
@@ -211,7 +211,7 @@ def test_the_page_on_python_names_the_public_interface():
 
 
 def test_the_reference_has_all_public_names():
-    page = (ROOT / "docs" / "reference.md").read_text()
+    page = "".join(path.read_text() for path in (ROOT / "docs" / "reference").glob("*.md"))
     named = re.findall(r"^::: (mitsuba_diffraction\.[\w.]+)$", page, re.MULTILINE)
     objects = [pkgutil.resolve_name(name) for name in named]
     for name in md.__all__:
@@ -256,11 +256,11 @@ def test_the_files_that_the_readme_names_exist():
         assert (ROOT / name).is_file(), name
 
 
-def test_the_manual_begins_with_the_table_of_the_readme():
-    def table(page):
-        return re.search(r"^\| you have \|.*?\n\n", page.read_text(encoding="utf-8"), re.MULTILINE | re.DOTALL)[0]
-
-    assert table(ROOT / "docs" / "index.md") == table(PAGES[0]).replace("](docs/", "](")
+def test_the_manual_begins_with_the_pages_of_the_readme():
+    (table,) = re.findall(r"^\| you have \|.*?\n\n", PAGES[0].read_text(encoding="utf-8"), re.MULTILINE | re.DOTALL)
+    pages = set(re.findall(r"\]\(docs/([\w.#-]+)\)", table))
+    assert len(pages) >= 8
+    assert pages <= set(re.findall(r"\]\(([\w.#-]+)\)", (ROOT / "docs" / "index.md").read_text(encoding="utf-8")))
 
 
 def test_the_readme_is_short():
@@ -300,6 +300,8 @@ def test_the_manual_is_built_without_warnings(tmp_path, caplog):
     for page in PAGES[1:]:
         place = "" if page.stem == "index" else page.stem
         assert (tmp_path / "site" / place / "index.html").is_file()
+    theory = (tmp_path / "site" / "theory" / "index.html").read_text(encoding="utf-8")
+    assert theory.count("<math") == (ROOT / "docs" / "theory.md").read_text(encoding="utf-8").count("```math")
     live = (tmp_path / "site" / "live" / "surfaces.html").read_text(encoding="utf-8")
     assert "<canvas" in live
     assert live.count('type="application/json"') == 10  # shaders, names, and eight surfaces

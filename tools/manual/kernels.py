@@ -1,4 +1,4 @@
-"""Print a table, summarised in docs/speed.md: the kernels that Dr.Jit compiles for a first picture of a scene, and for others.
+"""Print the kernels that Dr.Jit compiles for a first picture of a scene, and for others (docs/speed.md).
 
     python tools/manual/kernels.py [NAME …]
 

@@ -7,8 +7,10 @@ writes it to a folder instead.
 
 from __future__ import annotations
 
+import logging
 import sys
 from dataclasses import replace
+from functools import cache
 from pathlib import Path
 
 from mkdocs.config.defaults import MkDocsConfig
@@ -30,12 +32,15 @@ SURFACES = {
 }
 """Title, recipe and material of each, in the order of the list in the page of all."""
 ALL = "surfaces"
+_log = logging.getLogger("mkdocs.hooks.live_pages")
 
 
+@cache  # `mkdocs serve` builds the site anew after each change
 def live_page(name: str) -> str:
     """Return the page of one of `SURFACES`, or of `ALL`, as HTML."""
     surfaces = []
     for title, recipe, parameters in SURFACES.values() if name == ALL else [SURFACES[name]]:
+        _log.info(f"live/{name}.html: {title}, which takes minutes unless its spectrum is cached")
         surfaces.append(replace(Surface.named(RECIPES / recipe, parameters), name=title))
     return page(*surfaces)
 
