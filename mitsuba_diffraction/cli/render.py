@@ -5,6 +5,7 @@ from __future__ import annotations
 import logging
 import math
 import time
+from contextlib import suppress
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
@@ -17,6 +18,8 @@ from ..progress import bytes_text, durations, progress_bar, say, stage, tell
 from .arguments import Define, Overwrite, Variant, check_suffix, materials_of, scene_parameters
 
 if TYPE_CHECKING:
+    import mitsuba as mi
+
     from ..optics.color import ViewTransform
     from ..render.passes import Estimate
     from ..render.spectral_image import SpectralImage
@@ -194,17 +197,15 @@ def _announce(
 
 
 def _requests_denoising(scene: Path) -> bool:
-    """Return whether a scene requests a denoised preview; if it cannot be denoised, log a warning and return False."""
+    """Return whether a scene requests a denoised preview, and the denoiser is installed."""
     from ..render.denoise import check_requirements, is_requested
 
     if not is_requested(scene):
         return False
-    try:
+    with suppress(RequestError):
         check_requirements()
-    except RequestError as error:
-        _log.warning("%s; the scene requests a denoised preview, but this one is not denoised", error)
-        return False
-    return True
+        return True
+    return False
 
 
 def _check_output(output: Path | None, stored: dict[str, Any]) -> None:
@@ -276,14 +277,15 @@ def _picture(
     from ..render.denoise import check_requirements, denoised_picture
     from ..render.passes import Finished, Interrupted, checkpoint_path, discard_checkpoints
     from ..render.passes import render as trace
-    from ..render.scene import load_spectral_scene
     from ..render.spectral_image import exposure_of_preview, save_preview, stored_digest, wider_hats
 
     start = time.perf_counter()
     checkpoint, preview = checkpoint_path(path), _preview(path)
     earlier = stored_digest(path) if resume and path.is_file() and not checkpoint.exists() else None
+    scenes: list[mi.Scene] = []
     if denoise:
         check_requirements()
+        request = {**request, "on_load": partial(_keep, scenes)}
     interrupted = False
     try:
         with progress_bar(label, "spp", "loading and compiling") as progress:
@@ -312,7 +314,7 @@ def _picture(
             with stage("writing"):
                 image.save(path, **stored)
         with stage("preview"):
-            clean = partial(denoised_picture, load_spectral_scene(scene, **where)) if denoise else None
+            clean = partial(denoised_picture, scenes[0]) if scenes else None
             exposure = save_preview(image, preview, exposure, clean, view)
     except (OSError, RuntimeError) as error:
         kept = f"; {checkpoint} is kept, and --resume continues from it" if checkpoint.exists() else ""
@@ -337,6 +339,14 @@ def _picture(
         + (f"\n{preview}: preview, {exposed}" if _is_spectral(path) else f", {exposed}")
     )
     return exposure
+
+
+def _keep(scenes: list[mi.Scene], scene: mi.Scene) -> None:
+    """Keep a scene for the denoiser, once its guides of the first row show that it can be denoised."""
+    from ..render.denoise import guides
+
+    guides(scene, (0, 1))
+    scenes.append(scene)
 
 
 def _summary(image: SpectralImage, until_error: float | None, channels: str) -> str:

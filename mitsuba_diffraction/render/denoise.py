@@ -91,7 +91,7 @@ def _guides(scene: mi.Scene, first: int, end: int) -> tuple[NDArray[np.float32],
     pixel = dr.arange(mi.UInt32, (end - first) * columns * _SAMPLES_OF_GUIDES) // _SAMPLES_OF_GUIDES
     corner = mi.Point2f(pixel % columns, pixel // columns + dr.opaque(mi.UInt32, first))
     position = (corner + sampler.next_2d()) / mi.Point2f(columns, rows)
-    ray, _ = sensor.sample_ray(0.0, sampler.next_1d(), position, sampler.next_2d())
+    ray, _ = sensor.sample_ray_differential(0.0, sampler.next_1d(), position, sampler.next_2d())
     ray.wavelengths = type(ray.wavelengths)(*_ALBEDO_WAVELENGTHS, _ALBEDO_WAVELENGTHS[1])
     hit = scene.ray_intersect(ray)
     bsdf = hit.bsdf(ray)

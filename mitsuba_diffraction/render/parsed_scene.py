@@ -107,7 +107,8 @@ def files_of_scene(
             if node.props.type(key) == mi.Properties.Type.String
         ]
         named = [*map(resolved_file, state.files), *texts]
-    found = [file for file in named if file.is_file()]
+    # Numbers of a spectrum can be too long for a file name, at which Path.is_file raises.
+    found = [file for file in named if os.path.isfile(file)]
     return [*found, *(scan for file in found if file.suffix.lower() == ".toml" for scan in Recipe.load(file).files)]
 
 
@@ -203,7 +204,7 @@ def scene_digest(
             content.update(f"{node.props.plugin_name()}\n".encode())
             for name, value in node.props.items():
                 named = _file_named(node, name) if isinstance(value, str) else None
-                if named is None or not named.is_file():
+                if named is None or not os.path.isfile(named):
                     content.update(f"{name}={_exact_text(value)}\n".encode())
                 elif named.suffix.lower() == ".toml":
                     content.update(Recipe.load(named).digest().encode())

@@ -443,6 +443,7 @@ def render(
     tracer: Tracer = trace_locally,
     progress: Callable[[float, float, float], None] = lambda done, total, error: None,
     announce: Callable[[Estimate], None] = lambda estimate: None,
+    on_load: Callable[[mi.Scene], object] = lambda scene: None,
     on_checkpoint: Callable[[SpectralImage], object] = lambda image: None,
 ) -> SpectralImage:
     """Render the first sensor of a scene spectrally, with its own integrator, in the current variant.
@@ -467,6 +468,7 @@ def render(
             extrapolated from the current error), and the current error (NaN before four passes).
         announce: called after two passes (of the bands of a large picture: the first compiles), and again after a tenth
             of them if the time differs by more than a quarter from what was announced.
+        on_load: called with the scene before the first pass, unless the picture is `finished`.
         on_checkpoint: called after each checkpoint, while rendering goes on, with the picture so far. To bound memory,
             it is read from the sums block by block.
 
@@ -494,6 +496,8 @@ def render(
     columns, rows = (int(size) for size in scene.sensors()[0].film().crop_size())
     memory = check_memory(scene, max(job.samples), job.bands)
     disk = _check_disk(job, columns, checkpoint)
+    max_luminance = max_plausible_luminance(scene)
+    on_load(scene)
     channels = channel_wavelengths(job.spectral_range).size
     with nullcontext() if checkpoint is None else exclusive(checkpoint):
         sums = BandedSums(job.bands, columns, job.digest(), checkpoint, job.alpha, job.spectral_range)
@@ -510,7 +514,7 @@ def render(
         )
     if sums.done < len(job.bands):
         raise KeyboardInterrupt
-    _warn_of_implausible_pixels(sums.luminance, max_plausible_luminance(scene))
+    _warn_of_implausible_pixels(sums.luminance, max_luminance)
     image = _image(sums, job, Path(scene_path).name, complete=complete)
     if not complete:
         raise Interrupted(image)

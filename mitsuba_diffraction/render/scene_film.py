@@ -55,6 +55,11 @@ def replace_films(state: mi.parser.ParserState, width: int | None, height: int |
         props = mi.Properties(state.nodes[index].props)
         if kind == mi.ObjectType.Film:
             state.nodes[index].props = _spectral_film(state, props, width, height)
+        elif kind == mi.ObjectType.Sensor and "srf" in props:
+            raise RequestError(
+                "sensor: got srf, wanted none: the picture holds radiance at all wavelengths, which a response can "
+                "weight afterwards"
+            )
         elif kind == mi.ObjectType.Sensor and not children_of(state, props, mi.ObjectType.Film):
             props["film"] = add_child(state, mi.ObjectType.Film, _spectral_film(state, mi.Properties(), width, height))
             state.nodes[index].props = props

@@ -72,7 +72,8 @@ def _visible_points(scene: mi.Scene) -> tuple[mi.SurfaceInteraction3f, mi.Direct
     """Trace rays of the first sensor, and draw a light for each point hit; return points, lights and weights."""
     sampler = mi.load_dict({"type": "independent"})
     sampler.seed(0, _RAYS_OF_SENSOR)
-    ray, _ = scene.sensors()[0].sample_ray(0, sampler.next_1d(), sampler.next_2d(), sampler.next_2d())
+    # `irradiancemeter` has no other rays.
+    ray, _ = scene.sensors()[0].sample_ray_differential(0, sampler.next_1d(), sampler.next_2d(), sampler.next_2d())
     si = scene.ray_intersect(mi.Ray3f(ray))
     return si, *scene.sample_emitter_direction(si, sampler.next_2d(), False, si.is_valid())
 

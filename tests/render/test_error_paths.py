@@ -33,6 +33,12 @@ def one_line(message, call, error=RequestError):
         ("the scene has no sensor", '<scene version="3.0.0"><integrator type="path"/></scene>'),
         ("the scene has no integrator", f'<scene version="3.0.0">{CAMERA.format(8)}</scene>'),
         (
+            "sensor: got srf, wanted none",
+            CAMERA.format(8)
+            .replace("</sensor>", '<spectrum name="srf" value="500:0,530:1,560:0"/></sensor>')
+            .join(['<scene version="3.0.0"><integrator type="path"/>', "</scene>"]),
+        ),
+        (
             "film: width is 8.5, wanted a whole number of pixels",
             f'<scene version="3.0.0"><integrator type="path"/>{CAMERA.format(8.5).replace("integer", "float")}</scene>',
         ),

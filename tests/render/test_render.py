@@ -18,6 +18,7 @@ from mitsuba_diffraction.optics.color import spectrum_to_linear_sRGB, spectrum_t
 from mitsuba_diffraction.render import film, passes, render
 from mitsuba_diffraction.render.denoise import guides
 from mitsuba_diffraction.render.film import trace_pass
+from mitsuba_diffraction.render.parsed_scene import files_of_scene
 from mitsuba_diffraction.render.scene import load_spectral_scene
 from mitsuba_diffraction.render.scene_film import channel_wavelengths, channel_weights
 from mitsuba_diffraction.render.scene_light import max_plausible_luminance
@@ -76,6 +77,27 @@ def test_a_film_of_infrared_light_keeps_its_range(first, last, channels, llvm, t
     shown = np.array(Image.open(tmp_path / "preview.png"))
     assert (np.ptp(shown, axis=2) <= 1).all()
     assert shown.mean() == pytest.approx(137, abs=20)  # a quarter, in sRGB
+
+
+def test_an_irradiancemeter_gives_pi_times_a_constant_radiance(llvm, tmp_path):
+    # Regression: it was traced to the end, and the picture was lost, as it has no rays without differentials.
+    meter = (
+        f'<shape type="rectangle"><sensor type="irradiancemeter">{FILM}<sampler type="independent"/></sensor></shape>'
+    )
+    light = '<emitter type="constant"><spectrum name="radiance" value="2"/></emitter>'
+    image = render(write_scene(tmp_path, meter + light, sensor=""), spp=64)
+    assert image.radiance.mean() == pytest.approx(2 * math.pi, rel=0.01)
+
+
+def test_a_spectrum_of_many_values_in_the_scene_is_no_file_name(llvm, tmp_path):
+    # Regression: "file name too long".
+    wavelengths, values = (", ".join(f"{x:.6f}" for x in numbers) for numbers in (np.arange(360, 831, 5), np.ones(95)))
+    lamp = f"""<emitter type="constant"><spectrum name="radiance" type="irregular">
+        <string name="wavelengths" value="{wavelengths}"/><string name="values" value="{values}"/>
+        </spectrum></emitter>"""
+    path = write_scene(tmp_path, lamp)
+    assert files_of_scene(path) == [path]
+    assert render(path, spp=64).radiance.mean() == pytest.approx(1, rel=0.05)
 
 
 @pytest.mark.slow
@@ -210,6 +232,16 @@ def test_numbers_of_the_same_rays_come_from_one_kernel(llvm, tmp_path):
             work(scene)
             sizes = [kernel["size"] for kernel in dr.kernel_history((dr.KernelType.JIT,))]
         assert sizes.count(max(sizes)) <= 2, work  # random numbers and rays
+
+
+def test_the_brightest_light_is_found_before_the_first_pass(llvm, tmp_path, monkeypatch):
+    def fail(scene):
+        raise RuntimeError("no rays")
+
+    monkeypatch.setattr(passes, "max_plausible_luminance", fail)
+    monkeypatch.setattr(passes, "trace_pass", None)
+    with pytest.raises(RuntimeError, match="no rays"):
+        render(write_scene(tmp_path, CONSTANT), spp=1)
 
 
 @pytest.mark.parametrize("offset", [4, 16, 32])
