@@ -22,6 +22,7 @@ from bsdf_support import (
     use,
     vectors,
 )
+from covering import covering
 
 DIFFUSE = {"type": "diffuse", "reflectance": uniform(0.5)}
 ROUGH = {"type": "roughconductor", "alpha": 0.3}
@@ -252,9 +253,14 @@ def test_samples_follow_a_textured_base():
 
 
 @pytest.mark.few(3)
-@pytest.mark.parametrize("theta", [0, 70, 89, *(pytest.param(x, marks=pytest.mark.slow) for x in (30, 45, 80, 85))])
-@pytest.mark.parametrize("base", [{"type": "diffuse", "reflectance": uniform(1.0)}, {"type": "conductor"}])
-@pytest.mark.parametrize("name", ["blazed", "deep blazed", "elaphe"])
+@pytest.mark.parametrize(
+    ("theta", "name", "base"),
+    covering(
+        [0, 70, 89, 30, 45, 80, 85],
+        ["blazed", "deep blazed", "elaphe"],
+        [{"type": "diffuse", "reflectance": uniform(1.0)}, {"type": "conductor"}],
+    ),
+)
 def test_the_albedo_with_a_base_is_at_most_one(name, base, theta):
     count = 1 << 16
     _, weight = draw(over(base, name, 65.0), direction(theta, 30), count)

@@ -19,6 +19,7 @@ from bsdf_support import (
     use,
     vectors,
 )
+from covering import covering
 
 import mitsuba_diffraction as md
 from mitsuba_diffraction import testing
@@ -111,11 +112,10 @@ REDUCED = [
     ("sample", 60, 20, ALONE[1]),
     ("sample", 80, 200, WAVELENGTHS),
 ]
+DIRECTIONS = (0, 0), (30, 20), (30, 110), (60, 20), (60, 200), (80, 70), (80, 290)
 FULL = [
     (name, theta, phi, wavelengths)
-    for name in SMALL
-    for theta, phi in ((0, 0), (30, 20), (30, 110), (60, 20), (60, 200), (80, 70), (80, 290))
-    for wavelengths in (WAVELENGTHS, *ALONE)
+    for name, (theta, phi), wavelengths in covering([*SMALL], DIRECTIONS, (WAVELENGTHS, *ALONE))
 ]
 CASES = [*REDUCED, *(pytest.param(*case, marks=pytest.mark.slow) for case in FULL if case not in REDUCED)]
 
@@ -205,26 +205,21 @@ def effective_fraction(bsdf, theta, phi, draws, count):
 
 
 @pytest.mark.few(1)
-@pytest.mark.parametrize("phi", [0, 30, *(pytest.param(x, marks=pytest.mark.slow) for x in (60, 90, 180, 210, 300))])
 @pytest.mark.parametrize(
-    ("theta", "least"),
+    ("name", "theta", "phi"),
     [
-        (60, 0.5),
-        (85, 0.4),
-        *(pytest.param(theta, 0.5, marks=pytest.mark.slow) for theta in (0, 15, 30, 45, 75)),
+        pytest.param(*row, marks=pytest.mark.slow if row[0] in SKINS else ())
+        for row in covering([*BUNDLED], [60, 85, 0, 15, 30, 45, 75], [0, 30, 60, 90, 180, 210, 300])
     ],
 )
-@pytest.mark.parametrize("name", [pytest.param(x, marks=pytest.mark.slow if x in SKINS else ()) for x in BUNDLED])
-def test_the_effective_sample_fraction_is_above_its_bound(llvm, name, theta, least, phi):
+def test_the_effective_sample_fraction_is_above_its_bound(llvm, name, theta, phi):
     fraction, largest = effective_fraction(plugin(bundled(name)), theta, phi, draws=4, count=1 << 15)
-    assert fraction >= least
+    assert fraction >= (0.4 if theta == 85 else 0.5)
     assert largest < 20
 
 
 @pytest.mark.few(2)
-@pytest.mark.parametrize("phi", [90, 0, 30, 210])
-@pytest.mark.parametrize("theta", [75, 85, 60, 30, 0])
-@pytest.mark.parametrize("name", WIDE)
+@pytest.mark.parametrize(("name", "theta", "phi"), covering([*WIDE], [75, 85, 60, 30, 0], [90, 0, 30, 210]))
 def test_lobes_truncated_by_the_horizon_are_drawn_above_it(llvm, name, theta, phi):
     # Regression: 0.33 to 0.48 for light that comes in along the grooves, at 75° and more.
     bsdf = plugin(md.precompute(WIDE[name](), coherence_length=5.0, tolerance=1e-2))

@@ -9,6 +9,7 @@ import pytest
 import scipy.special
 import scipy.stats
 from bsdf_support import check_chi_square, direction, interaction, random_directions, six_samples, use, vectors
+from covering import covering
 
 import mitsuba_diffraction as md
 from mitsuba_diffraction import testing
@@ -212,11 +213,10 @@ def test_samples_from_above_have_similar_weights(profile, kind, theta):
 
 
 @pytest.mark.few(1)
-@pytest.mark.parametrize("reflects", [False, True])
-@pytest.mark.parametrize("above", [False, True])
-@pytest.mark.parametrize("is_sheet", [False, True])
-@pytest.mark.parametrize("theta", [50, 0, 85])
-@pytest.mark.parametrize("profile", ["film", "transmission_300"])
+@pytest.mark.parametrize(
+    ("profile", "theta", "is_sheet", "above", "reflects"),
+    covering(["film", "transmission_300"], [50, 0, 85], *[[False, True]] * 3),
+)
 def test_reflected_and_transmitted_orders_are_drawn_with_their_probabilities(profile, theta, is_sheet, above, reflects):
     spectrum = md.precompute(md.gratings.PROFILES[profile](), wavelengths=(240.0, 830.0), tolerance=0.01)
     table = OrderSampler(spectrum, Stack(1.0, constant(ETA)), is_sheet)

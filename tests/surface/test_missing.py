@@ -4,6 +4,7 @@ import time
 
 import numpy as np
 import pytest
+from covering import covering
 from hypothesis import given
 from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
@@ -53,10 +54,11 @@ def by_relaxation(heights, weight_x, weight_y, sweeps=4000):
 # ---------------------------------------------------------------- harmonic functions
 
 
-@pytest.mark.parametrize("hole", INTERIOR.values(), ids=INTERIOR)
-@pytest.mark.parametrize("function", HARMONIC.values(), ids=HARMONIC)
-@pytest.mark.parametrize("pixel_size", [(1.0, 1.0), (0.05, 0.2), (3.0, 0.1)])
+@pytest.mark.parametrize(
+    ("hole", "function", "pixel_size"), covering([*INTERIOR], [*HARMONIC], [(1.0, 1.0), (0.05, 0.2), (3.0, 0.1)])
+)
 def test_harmonic_functions_with_interior_holes_are_restored(function, hole, pixel_size):
+    function, hole = HARMONIC[function], INTERIOR[hole]
     heights = function(X * pixel_size[0], Y * pixel_size[1])
     np.testing.assert_allclose(harmonic_fill(without(heights, hole), pixel_size), heights, rtol=1e-9, atol=1e-9)
 
