@@ -23,7 +23,7 @@ from PIL import Image, ImageDraw, ImageFont
 from scipy import ndimage
 
 from mitsuba_diffraction.files.writing import whole_file
-from mitsuba_diffraction.optics.color import into_gamut, spectrum_to_linear_sRGB
+from mitsuba_diffraction.optics.color import into_gamut, on_screen, spectrum_to_linear_sRGB
 from mitsuba_diffraction.render import SpectralImage
 
 PHOTOGRAPH = Path(__file__).parents[1] / "precompute" / "measured" / "published" / "elaphe_photograph.jpg"
@@ -122,13 +122,17 @@ def main() -> None:
     below = np.stack(
         [ndimage.map_coordinates(rendering.rgb[..., k], [lines, columns], order=1, cval=0.0) for k in range(3)], -1
     )
-    # As bright as the photograph where green is brightest in the spectrum.
+    # Of the exposures in steps of a quarter of a stop, that whose spectrum is on average as bright as the photograph's.
     start, end = (round(photograph.mirror[0] / factor + fraction * WIDTH) for fraction in SPECTRUM)
     middle = round(photograph.mirror[1] / factor)
-    below /= below[middle - 3 : middle + 4, start:end, 1].mean(0).max()
-    # Saturated as by a camera.
-    below = np.rint(255 * colour.cctf_encoding(np.clip(below, 0, 1), function="sRGB")).astype(np.uint8)
-    figure = labelled({"photograph": np.asarray(shown.resize((WIDTH, height))), "rendering": below})
+    spectrum_of = np.s_[middle - 3 : middle + 4, start:end]
+    above = np.asarray(shown.resize((WIDTH, height)))
+    exposures = 2 ** np.arange(-4, 4, 0.25) / below[spectrum_of].max()
+    below = min(
+        (on_screen(below * exposure) for exposure in exposures),
+        key=lambda picture: abs(picture[spectrum_of].mean() - above[spectrum_of].mean()),
+    )
+    figure = labelled({"photograph": above, "rendering": below})
     with whole_file(arguments.figure) as temporary:
         figure.save(temporary, "PNG", optimize=True)
 

@@ -1,31 +1,26 @@
 """Spectra to colours: spectral radiance → CIE XYZ → linear sRGB → display.
 
-Observer: CIE 1931, 2°, from colour-science. Primaries and white point (D65) of sRGB (IEC 61966-2-1).
+Observer: CIE 1931, 2°. Primaries and white point (D65) of sRGB (IEC 61966-2-1). For a display, `into_gamut` and
+`roll_off` reduce chroma at constant hue of Oklab (Ottosson 2020, A perceptual color space for image processing).
 
 Scale: XYZ is divided by the Y of a flat spectrum of one, ∫ȳ dλ = 106.857 nm, so that a constant 1 W m⁻² sr⁻¹ nm⁻¹ has
 luminance 1, as in Mitsuba's RGB film. There is no chromatic adaptation: a flat spectrum is slightly pink relative to
 D65.
-
-colour-science is imported inside the functions that use it, because the import takes more than a second, as long as a
-small rendering. Renderings need the observer alone, which is kept in the cache.
 """
 
 from __future__ import annotations
 
 import os
 from collections.abc import Callable
-from contextlib import suppress
 from functools import cache, lru_cache
-from importlib import metadata
+from pathlib import Path
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from ..errors import RequestError
-from ..files.writing import UNSEALED, cache_folder, is_intact, seal, whole_file
 from ..settings import VISIBLE
 
-_OBSERVER = "CIE 1931 2 Degree Standard Observer"
 _D65 = (0.3127, 0.3290)  # x and y
 
 # IEC 61966-2-1:1999
@@ -34,23 +29,9 @@ SRGB_TO_XYZ = np.array([[0.4124, 0.3576, 0.1805], [0.2126, 0.7152, 0.0722], [0.0
 
 
 @cache
-def _observer() -> NDArray[np.float64]:
-    """Return λ in nm and x̄, ȳ, z̄ of the observer, (n, 4)."""
-    path = cache_folder() / f"observer-{metadata.version('colour-science')}.txt"
-    # A damaged file, or none.
-    with suppress(OSError, ValueError):
-        if is_intact(path):
-            return np.loadtxt(path)
-    import colour
-
-    cmfs = colour.MSDS_CMFS[_OBSERVER]
-    table = np.column_stack([cmfs.wavelengths, cmfs.values])
-    with suppress(OSError, RequestError):
-        path.parent.mkdir(parents=True, exist_ok=True)
-        with whole_file(path) as temporary:
-            np.savetxt(temporary, table, "%.17g", header=UNSEALED)
-            seal(temporary)
-    return table
+def observer() -> NDArray[np.float64]:
+    """Return λ in nm, x̄, ȳ, z̄ and the illuminant D65 relative to 560 nm (CIE 15:2018) at each nm, (471, 5)."""
+    return np.loadtxt(Path(__file__).parents[1] / "data" / "observer.csv", delimiter=",")
 
 
 def matching_functions(wavelengths: ArrayLike) -> NDArray[np.float64]:
@@ -58,7 +39,7 @@ def matching_functions(wavelengths: ArrayLike) -> NDArray[np.float64]:
 
     They are interpolated linearly between the wavelengths of the observer and constant outside.
     """
-    known, *columns = _observer().T
+    known, *columns, _ = observer().T
     return np.stack([np.interp(np.asarray(wavelengths), known, column) for column in columns], axis=1)
 
 
@@ -132,23 +113,51 @@ def linear_sRGB_to_XYZ(rgb: NDArray[np.floating]) -> NDArray[np.float64]:
     return rgb @ SRGB_TO_XYZ.T
 
 
+_DARK = 216 / 24389  # below which lightness is linear, as in CIE L*
+
+
+def _lab(XYZ: ArrayLike) -> NDArray[np.float64]:
+    """Return CIE L*a*b* (CIE 15:2018) relative to D65 with Y = 1, (..., 3)."""
+    x, y = _D65
+    ratio = np.asarray(XYZ, np.float64) / [x / y, 1, (1 - x - y) / y]
+    f = np.where(ratio > _DARK, np.cbrt(ratio), 841 / 108 * ratio + 4 / 29)
+    return np.stack([116 * f[..., 1] - 16, 500 * (f[..., 0] - f[..., 1]), 200 * (f[..., 1] - f[..., 2])], axis=-1)
+
+
 def delta_E(XYZ_1: ArrayLike, XYZ_2: ArrayLike) -> NDArray[np.float64]:
     """Compute the colour difference CIEDE2000 (CIE 142, ISO/CIE 11664-6) relative to D65 with Y = 1.
 
-    Both colours are (..., 3), the result is (...).
+    Both colours are (..., 3), the result is (...). Symbols as in Sharma, Wu and Dalal 2005, The CIEDE2000
+    color-difference formula.
     """
-    import colour
+    (L_1, a_1, b_1), (L_2, a_2, b_2) = (np.moveaxis(_lab(XYZ), -1, 0) for XYZ in (XYZ_1, XYZ_2))
 
-    white = colour.CCS_ILLUMINANTS[_OBSERVER]["D65"]
-    return colour.delta_E(*(colour.XYZ_to_Lab(np.asarray(XYZ), white) for XYZ in (XYZ_1, XYZ_2)), method="CIE 2000")
+    def chroma_weight(chroma: NDArray[np.float64]) -> NDArray[np.float64]:
+        return np.sqrt(chroma**7 / (chroma**7 + 25.0**7))
+
+    G = 0.5 * (1 - chroma_weight((np.hypot(a_1, b_1) + np.hypot(a_2, b_2)) / 2))
+    C_1, C_2 = np.hypot((1 + G) * a_1, b_1), np.hypot((1 + G) * a_2, b_2)
+    h_1, h_2 = (np.arctan2(b, (1 + G) * a) % (2 * np.pi) for a, b in ((a_1, b_1), (a_2, b_2)))
+    grey = C_1 * C_2 == 0
+    turn = np.where(grey, 0.0, (h_2 - h_1 + np.pi) % (2 * np.pi) - np.pi)
+    h = np.where(grey, h_1 + h_2, h_1 + turn / 2)
+    L, C = (L_1 + L_2) / 2, (C_1 + C_2) / 2
+    T = 1 - 0.17 * np.cos(h - np.pi / 6) + 0.24 * np.cos(2 * h)
+    T += 0.32 * np.cos(3 * h + np.pi / 30) - 0.2 * np.cos(4 * h - np.deg2rad(63))
+    dL = (L_2 - L_1) / (1 + 0.015 * (L - 50) ** 2 / np.sqrt(20 + (L - 50) ** 2))
+    dC = (C_2 - C_1) / (1 + 0.045 * C)
+    dH = 2 * np.sqrt(C_1 * C_2) * np.sin(turn / 2) / (1 + 0.015 * C * T)
+    from_blue = (np.rad2deg(h) % 360 - 275) / 25
+    R_T = -2 * chroma_weight(C) * np.sin(np.deg2rad(60) * np.exp(-(from_blue**2)))
+    return np.sqrt(np.maximum(dL**2 + dC**2 + dH**2 + R_T * dC * dH, 0.0))
 
 
 def daylight(wavelengths: ArrayLike) -> NDArray[np.float64]:
-    """Return the illuminant D65 (CIE 15:2018) relative to its value at 560 nm, linearly interpolated: (n,), nm."""
-    import colour
+    """Return the illuminant D65 (CIE 15:2018) relative to its value at 560 nm, linearly interpolated: (n,), nm.
 
-    table = colour.SDS_ILLUMINANTS["D65"]
-    return np.interp(np.asarray(wavelengths), table.wavelengths, table.values) / 100
+    It is constant outside 360 to 780 nm.
+    """
+    return np.interp(np.asarray(wavelengths), observer()[:, 0], observer()[:, 4])
 
 
 def lamp_to_linear_sRGB(wavelengths: NDArray[np.float64]) -> NDArray[np.float64]:
@@ -168,7 +177,6 @@ def lamp_to_linear_sRGB(wavelengths: NDArray[np.float64]) -> NDArray[np.float64]
 
 
 _UPSAMPLING_STEPS, _MIN_DAMPING = 60, 1e-9
-_DARK = 216 / 24389  # below which lightness is linear, as in CIE L*
 
 
 def upsampled(rgb: NDArray[np.floating], matrix: NDArray[np.floating]) -> NDArray[np.float64]:
@@ -215,42 +223,92 @@ def upsampled(rgb: NDArray[np.floating], matrix: NDArray[np.floating]) -> NDArra
     return spectra_of(c)[index].reshape(*np.shape(rgb)[:-1], len(matrix))
 
 
-def into_gamut(rgb: NDArray[np.floating]) -> NDArray[np.float64]:
-    """Desaturate colours outside the sRGB gamut towards the grey of equal luminance, until no component is negative.
+_SRGB_TO_LMS = np.array(
+    [
+        [0.4122214708, 0.5363325363, 0.0514459929],
+        [0.2119034982, 0.6806995451, 0.1073969566],
+        [0.0883024619, 0.2817188376, 0.6299787005],
+    ]
+)
+_LMS_TO_SRGB = np.linalg.inv(_SRGB_TO_LMS)
+_LIGHTNESS = np.array([0.2104542553, 0.7936177850, -0.0040720468])  # of Oklab, from the cube roots of LMS
+_SHOULDER_START = 0.8
+_ROUNDNESS = 0.3
+_BISECTIONS = 20
 
-    c' = Y + t (c − Y), with the largest t ≤ 1 for which min(c') ≥ 0. Luminance is preserved, and so is the dominant
-    wavelength. Clamping each channel at zero would instead brighten spectral colours, above all cyan and violet. The
+
+def _with_chroma(rgb: NDArray[np.floating], factor: float | NDArray[np.floating]) -> NDArray[np.float64]:
+    """Multiply the chroma of Oklab by factors (..., 1), at constant hue and lightness; linear sRGB, (..., 3)."""
+    root = np.cbrt(rgb @ _SRGB_TO_LMS.T)
+    grey = (root @ _LIGHTNESS)[..., None]  # in Oklab, the three roots of a grey are its lightness
+    return (grey + factor * (root - grey)) ** 3 @ _LMS_TO_SRGB.T
+
+
+def _is_inside(rgb: NDArray[np.floating]) -> NDArray[np.bool_]:
+    """Whether colours are in the rounded gamut, linear sRGB (..., 3) → (..., 1)."""
+    mean = rgb.mean(axis=-1, keepdims=True)
+    return (rgb.min(axis=-1, keepdims=True) >= 0) & (rgb.prod(axis=-1, keepdims=True) >= (_ROUNDNESS * mean) ** 3)
+
+
+def _shoulder(x: NDArray[np.floating]) -> NDArray[np.floating]:
+    """Return x up to 0.8 and 1 − d²/(x + d − 0.8), d = 0.2, above, which is smooth and tends to 1."""
+    d = 1 - _SHOULDER_START
+    return np.where(x > _SHOULDER_START, 1 - d * d / (np.maximum(x - _SHOULDER_START, 0.0) + d), x)
+
+
+def into_gamut(rgb: NDArray[np.floating]) -> NDArray[np.float64]:
+    """Desaturate colours near and outside the boundary of the sRGB gamut, at constant luminance and hue of Oklab.
+
+    The gamut is rounded: the geometric mean of the components is at least 0.3 of their arithmetic mean. It has no
+    corners, at which the colours of a spectrum would have edges. For a chroma of x times that of the boundary at the
+    same hue, colours are unchanged up to x = 0.8; above, x becomes 1 − d²/(x + d − 0.8), d = 0.2, as in `roll_off`. The
     result is black where the luminance is not positive or a value is not finite. Both are linear sRGB, (..., 3).
     """
     rgb = np.asarray(rgb, dtype=np.float64)
     rgb = np.where(np.isfinite(rgb).all(axis=-1, keepdims=True), rgb, 0.0)
-    luminance = rgb @ SRGB_TO_XYZ[1]
-    luminance = np.maximum(luminance, 0.0)[..., None]
-    min_value = np.minimum(rgb.min(axis=-1, keepdims=True), 0.0)
-    span = luminance - min_value
-    t = np.divide(luminance, span, out=np.zeros_like(span), where=span > 0)
-    return np.maximum(luminance + t * (rgb - luminance), 0.0)
+    luminance = np.maximum(rgb @ SRGB_TO_XYZ[1], 0.0)[..., None]
+    result = np.where(luminance > 0, rgb, 0.0)
+    changed = (luminance > 0)[..., 0] & ~_is_inside(_with_chroma(rgb, 1 / _SHOULDER_START))[..., 0]
+    colours = rgb[changed] / luminance[changed]
+    inside, outside = np.zeros((len(colours), 1)), np.full((len(colours), 1), 1 / _SHOULDER_START)
+    for _ in range(_BISECTIONS):
+        middle = (inside + outside) / 2
+        found = _is_inside(_with_chroma(colours, middle))
+        inside, outside = np.where(found, middle, inside), np.where(found, outside, middle)
+    mapped = np.maximum(_with_chroma(colours, outside * _shoulder(1 / outside)), 0.0)
+    found = (mapped @ SRGB_TO_XYZ[1])[..., None]
+    # Of no colour that can be seen is the lightness negative; such a one becomes grey.
+    result[changed] = luminance[changed] * np.divide(mapped, found, out=np.ones_like(mapped), where=found > 0)
+    return result
 
 
-_SHOULDER_START = 0.8
 _WHITENING = 0.15  # a pixel ten times too bright is desaturated by 58 %
 
 
-def roll_off(rgb: NDArray[np.floating]) -> NDArray[np.float64]:
-    """Compress highlights into [0, 1] without a shift of hue.
+def _size(rgb: NDArray[np.floating]) -> NDArray[np.floating]:
+    """Return a smooth norm, at least the brightest channel and at most 1.09 times it: (..., 3) → (..., 1).
 
-    The brightest channel p of a pixel is unchanged up to 0.8. Above, it becomes 1 − d²/(p + d − 0.8) with d = 0.2,
-    which is smooth and tends to 1. The other channels are scaled by the same factor. Very bright pixels are then
-    desaturated. This is the Khronos PBR Neutral tone mapper (Khronos Group, 2024) without its toe, which applies to
-    dielectric surfaces. Both are linear sRGB, (..., 3), not negative.
+    It is the mean μ plus the 3-norm of what exceeds it, and hence μ for a grey.
     """
-    peak = rgb.max(axis=-1, keepdims=True)
-    d = 1 - _SHOULDER_START
-    excess = np.maximum(peak - _SHOULDER_START, 0.0)
-    shown = np.where(excess > 0, 1 - d * d / (excess + d), peak)
-    scaled = rgb * np.divide(shown, peak, out=np.ones_like(peak), where=peak > 0)
-    white = 1 - 1 / (_WHITENING * (peak - shown) + 1)
-    return scaled + white * (shown - scaled)
+    mean = rgb.mean(axis=-1, keepdims=True)
+    return mean + np.cbrt((np.maximum(rgb - mean, 0.0) ** 3).sum(axis=-1, keepdims=True))
+
+
+def roll_off(rgb: NDArray[np.floating]) -> NDArray[np.float64]:
+    """Compress highlights into [0, 1] at constant hue of Oklab.
+
+    A smooth norm p of a pixel, about its brightest channel, is unchanged up to 0.8. Above, it becomes
+    1 − d²/(p + d − 0.8) with d = 0.2, which is smooth and tends to 1. Very bright pixels are also desaturated. Both
+    curves are those of the Khronos PBR Neutral tone mapper (Khronos Group, 2024), without its toe, which applies to
+    dielectric surfaces. Both colours are linear sRGB, (..., 3), not negative.
+    """
+    result = np.array(rgb, np.float64)
+    bright = _size(result)[..., 0] > _SHOULDER_START
+    size = _size(result[bright])
+    shown = _shoulder(size)
+    whiter = np.maximum(_with_chroma(result[bright], 1 / (_WHITENING * (size - shown) + 1)), 0.0)
+    result[bright] = whiter * shown / _size(whiter)
+    return result
 
 
 def auto_exposure(rgb: NDArray[np.floating]) -> float:

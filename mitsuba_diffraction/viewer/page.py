@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 
 from ..errors import RequestError
 from ..files.outputs import MARK
+from ..optics.color import observer
 from ..optics.materials import conductor
 from ..settings import FROM_RADIUS, SUN_COHERENCE_LENGTH, VISIBLE
 from ..spectrum.grids import OrderGrid
@@ -243,7 +244,7 @@ def _nanometres() -> NDArray[np.float64]:
 
 def _light() -> NDArray[np.float32]:
     """Return x̄, ȳ, z̄ and the light, D65 with Y = 1, at each nm: (471, 4)."""
-    table = np.loadtxt(_ASSETS / "observer.csv", delimiter=",")
+    table = observer()
     matching, light = table[:, 1:4] / table[:, 2].sum(), table[:, 4]
     return np.column_stack([matching, light / (light @ matching[:, 1])]).astype(np.float32)
 

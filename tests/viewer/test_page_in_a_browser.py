@@ -15,7 +15,7 @@ from mitsuba_diffraction.bsdf.directions import rotated
 from mitsuba_diffraction.evaluation.realtime_shader.diffraction_shader import PUBLISHED_BRIGHTNESS
 from mitsuba_diffraction.evaluation.realtime_shader.evaluate import VARIANTS, shader_for
 from mitsuba_diffraction.evaluation.realtime_shader.quirks import Quirks
-from mitsuba_diffraction.optics.color import delta_E, spectrum_to_XYZ
+from mitsuba_diffraction.optics.color import delta_E, into_gamut, on_screen, spectrum_to_linear_sRGB, spectrum_to_XYZ
 from mitsuba_diffraction.render import render
 from mitsuba_diffraction.viewer import page as pages
 from mitsuba_diffraction.viewer.viewed_surface import Surface
@@ -638,6 +638,32 @@ def test_a_reference_picture_is_compared(opened):
     assert shown == "reference"
     assert tab.locator("#legend").is_visible()
     assert tab.messages == [tab.url[:80]]
+
+
+def test_colours_are_shown_as_in_previews(opened):
+    """Lines of a spectrum beside a grey, from dark to bright, against the preview of the same picture."""
+    lines = spectrum_to_linear_sRGB(np.eye(81)[10:70:6], np.arange(380.0, 781.0, 5.0))
+    light = np.concatenate([factor * lines / lines.max() for factor in (0.1, 1.0, 8.0)] + [np.full((1, 3), 0.5)])
+    picture = np.tile(np.repeat(light, 4, 0), (200, 1, 1))
+    blaze = Surface.named("blazed", {"depth": 0.1, "samples": 64, "coherence_length": 3.0})
+    tab = opened(blaze, picture=picture.astype(np.float16))
+    tab.evaluate("viewer.set({ maxFrames: 1, right: 'picture', divider: 0, exposure: 0 })")
+    wait_for_frames(tab)
+    row = tab.evaluate(
+        """(() => {
+          const { gl } = viewer.renderer, [width, height] = [gl.drawingBufferWidth, gl.drawingBufferHeight];
+          const values = new Uint8Array(4 * width);
+          gl.bindFramebuffer(gl.FRAMEBUFFER, null);
+          gl.readPixels(0, height >> 1, width, 1, gl.RGBA, gl.UNSIGNED_BYTE, values);
+          return Array.from(values);
+        })()"""
+    )
+    row = np.array(row, int).reshape(-1, 4)[1:, :3]  # the first is the divider
+    found = row[np.concatenate([[True], np.any(np.diff(row, axis=0), axis=1)])]
+    found = found[found.any(axis=1)]
+    wanted = on_screen(into_gamut(light.astype(np.float16)) * tab.evaluate("viewer.renderer.normal"))
+    assert len(found) == len(wanted)
+    np.testing.assert_allclose(found, wanted, atol=1)
 
 
 @pytest.mark.slow

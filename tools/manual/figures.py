@@ -112,7 +112,7 @@ FIGURES = (
     notebook("scalar_theory.png", "05_can_i_trust_the_picture", "cell-07", 3),
     Figure(
         ("screen.png",),
-        """mitsuba-diffraction render scenes/screen.xml --spp 192 -o {out}/screen.exr
+        """mitsuba-diffraction render scenes/screen.xml --spp 384 -o {out}/screen.exr
         python scenes/screen.py {out}/screen.exr {out}/screen.png""",
         2,
     ),

@@ -10,6 +10,7 @@ import mitsuba as mi
 import numpy as np
 
 from ...bsdf.testing import vectors
+from ...optics.color import SRGB_TO_XYZ
 from ...optics.geometry import k_g
 from ..realtime_shader.evaluate import shader_for
 from ..realtime_shader.quirks import Quirks
@@ -93,12 +94,10 @@ def shading(rays: Rays, shader: Shader) -> Callable[[], None]:
 
 def shader_difference(shader: Shader, exact: Exact) -> tuple[float, float]:
     """Return mean and maximum CIEDE2000 of the patches against the exact model, after one factor of exposure."""
-    import colour
-
     wi, wo = patch_directions()
     cos_half = np.sqrt((1 + (wi * wo).sum(axis=-1)) / 2)
     factor = k_g(wi[:, 2], wo[:, 2], ((wi + wo)[:, :2] ** 2).sum(axis=-1))
     wanted = exact.xyz * ((PUBLISHED_R0 + (1 - PUBLISHED_R0) * (1 - cos_half) ** 5) * factor)[:, None]
     rgb = np.array(shader.rgb(vectors(wi), vectors(wo), shader.weights()), np.float64).T
-    xyz = rgb @ colour.RGB_COLOURSPACES["sRGB"].matrix_RGB_to_XYZ.T
+    xyz = rgb @ SRGB_TO_XYZ.T
     return patch_difference(wanted, xyz * (wanted[:, 1].sum() / xyz[:, 1].sum()))

@@ -11,7 +11,7 @@ from numpy.typing import ArrayLike, NDArray
 from scipy.optimize import lsq_linear
 
 from ...bsdf.device_tables import PacketTable
-from ...optics.color import daylight, matching_functions
+from ...optics.color import SRGB_TO_XYZ, XYZ_TO_SRGB, daylight, matching_functions
 from ...settings import VISIBLE
 from .quirks import Quirks
 
@@ -51,9 +51,7 @@ def light_weights(spectrum: ArrayLike) -> NDArray[np.float64]:
 
 def rgb_matrix(*, cie_rgb_matrix: bool) -> NDArray[np.float64]:
     """Return the matrix XYZ → linear RGB, of CIE RGB or sRGB (IEC 61966-2-1)."""
-    import colour
-
-    return CIE_RGB if cie_rgb_matrix else np.array(colour.RGB_COLOURSPACES["sRGB"].matrix_XYZ_to_RGB)
+    return CIE_RGB if cie_rgb_matrix else XYZ_TO_SRGB
 
 
 class SpectralWeights:
@@ -107,18 +105,17 @@ def primary_spectra() -> NDArray[np.float64]:
     The spectrum Σ_c RGB_c b_c(λ) has the colour RGB. b_c is the non-negative spectrum of least power, whose smoothness
     keeps the noise of wavelength sampling low.
     """
-    import colour
-
     fine = np.arange(EMISSION[0], EMISSION[-1] + 0.5)
     hats = np.maximum(0.0, 1 - np.abs(fine[:, None] - EMISSION) / (EMISSION[1] - EMISSION[0]))
     to_xyz = matching_functions(fine).T @ hats / FLAT
-    primaries = colour.RGB_COLOURSPACES["sRGB"].matrix_RGB_to_XYZ
     system = np.concatenate([1e4 * to_xyz, 1e-2 * np.eye(EMISSION.size)])
     rest = np.zeros(EMISSION.size)
-    spectra = [lsq_linear(system, np.concatenate([1e4 * target, rest]), bounds=(0, np.inf)).x for target in primaries.T]
+    spectra = [
+        lsq_linear(system, np.concatenate([1e4 * target, rest]), bounds=(0, np.inf)).x for target in SRGB_TO_XYZ.T
+    ]
     result = np.stack(spectra, axis=1)
     # Removes the small colour error due to the least-power term.
-    result = result @ np.linalg.solve(to_xyz @ result, primaries)
+    result = result @ np.linalg.solve(to_xyz @ result, SRGB_TO_XYZ)
     result.setflags(write=False)
     return result
 

@@ -16,20 +16,68 @@ vec3 toLinear(vec3 xyz) {
               dot(vec3(0.0557, -0.2040, 1.0570), xyz));
 }
 
-vec3 intoGamut(vec3 rgb, float luminance) {
-  luminance = max(luminance, 0.0);
-  float lowest = min(min(min(rgb.r, rgb.g), rgb.b), 0.0);
-  float span = luminance - lowest;
-  return max(luminance + (span > 0.0 ? luminance / span : 0.0) * (rgb - luminance), 0.0);
+// Columns of linear sRGB to LMS of Oklab, and back.
+const mat3 TO_LMS = mat3(0.4122214708, 0.2119034982, 0.0883024619, 0.5363325363, 0.6806995451, 0.2817188376,
+                         0.0514459929, 0.1073969566, 0.6299787005);
+const mat3 FROM_LMS = mat3(4.0767416621, -1.2684380046, -0.0041960863, -3.3077115913, 2.6097574011, -0.7034186147,
+                           0.2309699292, -0.3413193965, 1.7076147010);
+const vec3 LUMINANCE = vec3(0.2126, 0.7152, 0.0722);
+const float SHOULDER_START = 0.8, ROUNDNESS = 0.3, WHITENING = 0.15;
+
+float greyOf(vec3 root) {
+  return dot(vec3(0.2104542553, 0.7936177850, -0.0040720468), root);
+}
+
+// Linear sRGB with a chroma multiplied by a factor, from the cube roots of LMS.
+vec3 withChroma(vec3 root, float factor) {
+  vec3 mixed = greyOf(root) + factor * (root - greyOf(root));
+  return FROM_LMS * (mixed * mixed * mixed);
+}
+
+vec3 rootOf(vec3 rgb) {
+  vec3 lms = TO_LMS * rgb;
+  return sign(lms) * pow(abs(lms), vec3(1.0 / 3.0));
+}
+
+bool isInside(vec3 rgb) {
+  float limit = ROUNDNESS * (rgb.r + rgb.g + rgb.b) / 3.0;
+  return min(min(rgb.r, rgb.g), rgb.b) >= 0.0 && rgb.r * rgb.g * rgb.b >= limit * limit * limit;
+}
+
+float shoulder(float x) {
+  float d = 1.0 - SHOULDER_START;
+  return x <= SHOULDER_START ? x : 1.0 - d * d / (x - SHOULDER_START + d);
+}
+
+vec3 intoGamut(vec3 rgb) {
+  float luminance = dot(LUMINANCE, rgb);
+  if (!(luminance > 0.0)) return vec3(0.0);
+  vec3 root = rootOf(rgb / luminance);
+  float inside = 0.0, outside = 1.0 / SHOULDER_START;
+  if (isInside(withChroma(root, outside))) return rgb;
+  for (int i = 0; i < 20; i++) {
+    float middle = 0.5 * (inside + outside);
+    if (isInside(withChroma(root, middle))) inside = middle;
+    else outside = middle;
+  }
+  vec3 mapped = max(withChroma(root, outside * shoulder(1.0 / outside)), 0.0);
+  float found = dot(LUMINANCE, mapped);
+  return luminance * (found > 0.0 ? mapped / found : vec3(1.0));
+}
+
+// A smooth norm, about the brightest channel.
+float sizeOf(vec3 rgb) {
+  float mean = (rgb.r + rgb.g + rgb.b) / 3.0;
+  vec3 more = max(rgb - mean, 0.0);
+  return mean + pow(dot(more * more, more), 1.0 / 3.0);
 }
 
 vec3 rollOff(vec3 rgb) {
-  float peak = max(max(rgb.r, rgb.g), rgb.b);
-  if (peak <= 0.8) return rgb;
-  float shown = 1.0 - 0.04 / (peak - 0.8 + 0.2);
-  float white = 1.0 - 1.0 / (0.15 * (peak - shown) + 1.0);
-  vec3 scaled = rgb * shown / peak;
-  return scaled + white * (shown - scaled);
+  float size = sizeOf(rgb);
+  if (size <= SHOULDER_START) return rgb;
+  float shown = shoulder(size);
+  vec3 whiter = max(withChroma(rootOf(rgb), 1.0 / (WHITENING * (size - shown) + 1.0)), 0.0);
+  return whiter * shown / sizeOf(whiter);
 }
 
 vec3 encode(vec3 rgb) {
@@ -39,7 +87,7 @@ vec3 encode(vec3 rgb) {
 
 // Linear sRGB that the screen emits.
 vec3 shown(vec3 rgb, float exposure) {
-  return clamp(rollOff(exposure * intoGamut(rgb, dot(vec3(0.2126, 0.7152, 0.0722), rgb))), 0.0, 1.0);
+  return clamp(rollOff(exposure * intoGamut(rgb)), 0.0, 1.0);
 }
 
 vec3 ofMean(vec4 mean) {
