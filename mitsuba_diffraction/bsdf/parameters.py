@@ -121,19 +121,24 @@ def _densest(medium: RefractiveIndex, nominal: float) -> float:
 
 
 class Scales:
-    """The scales of heights and lengths of a scene.
+    """The scales of heights and lengths of a scene; iterates over both.
 
     Attributes:
         height: of the heights.
-        lateral: of the lengths along the surface; None if it is the number 1.
     """
 
     def __init__(self, props: mi.Properties) -> None:
-        self.height, lateral = (VaryingNumber(props, name, 1.0) for name in ("height_scale", "lateral_scale"))
-        self.lateral = lateral if lateral.varies or lateral.values[0] != 1 else None
+        self.height, self._lateral = (VaryingNumber(props, name, 1.0) for name in ("height_scale", "lateral_scale"))
 
     def __iter__(self) -> Iterator[VaryingNumber]:
-        return iter([self.height] if self.lateral is None else [self.height, self.lateral])
+        return iter([self.height, self._lateral])
+
+    @property
+    def lateral(self) -> VaryingNumber | None:
+        """The scale of lengths along the surface; None if it is the number 1 and nothing is derived by it."""
+        of_lengths = self._lateral
+        is_one = not of_lengths.varies and of_lengths.values[0] == 1 and not dr.grad_enabled(of_lengths.value)
+        return None if is_one else of_lengths
 
     @property
     def max_scale(self) -> float:
@@ -149,13 +154,14 @@ class Scales:
         height = larger(self.height.at(si, active), _MIN_HEIGHT_SCALE)
         if self.lateral is None:
             return height, mi.Float(1.0)
-        lateral = self.lateral.at(si, active)
+        # Not the number itself: Dr.Jit cannot differentiate a branch in a virtual call that takes a member as it is.
+        lateral = larger(self.lateral.at(si, active), _MIN_LATERAL_SCALE)
         return height / lateral, lateral
 
     @property
     def laterals(self) -> tuple[float, float]:
         """Bounds of the lateral scale."""
-        return (1.0, 1.0) if self.lateral is None else (float(self.lateral.values[0]), float(self.lateral.values[-1]))
+        return float(self._lateral.values[0]), float(self._lateral.values[-1])
 
     def ratios(self) -> tuple[float, float]:
         """Return bounds of the ratio of height scale to lateral scale."""
@@ -189,8 +195,9 @@ class Scales:
                     "divided by the scale" + (f", here {shortest / high:.4g} nm" if high > covered else "")
                 )
         if self.lateral is not None and (max_resolved is None or self.lateral.values[-1] > max_resolved):
+            derivative = " with a derivative" if dr.grad_enabled(self.lateral.value) else ""
             raise RequestError(
-                f"lateral_scale: got {self.lateral}, wanted 1"
+                f"lateral_scale: got {self.lateral}{derivative}, wanted 1"
                 + ("" if max_resolved is None else f" or less than {max_resolved:.4g}")
                 + ": only of orders that do not overlap the lobes keep their width (not of samples, of tiles as large "
                 "as the coherence length, nor of line gratings with a coherence length below 15 um)"

@@ -95,7 +95,7 @@ class SharedTables:
         """
         spectrum, (low, high) = self._spectrum, scales.ratios()
         per_step = spectrum.max_kappa * spectrum.height_range / MAX_NODE_PHASE_STEP
-        if low == high and not scales.height.varies and dr.grad_enabled(scales.height.value):
+        if low == high and any(not scale.varies and dr.grad_enabled(scale.value) for scale in scales):
             # Wide enough for differences of values that are stored as bytes.
             half = 1 / max(per_step, 10)
             low, high = max(low - half, 0.0), low + half

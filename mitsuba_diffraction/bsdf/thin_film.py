@@ -272,8 +272,7 @@ class _Filmed(Material):
 
     def traverse(self, callback: mi.TraversalCallback) -> None:
         self.below.traverse(callback)
-        if self.scale.varies or self.scale.values[0] != 1:
-            self.scale.put(callback)
+        self.scale.put(callback)
 
 
 class FilmedMaterial(_Filmed):
@@ -313,9 +312,7 @@ class FilmedMaterial(_Filmed):
     def _waves(
         self, si: mi.SurfaceInteraction3f, cos: mi.Float, active: mi.Bool, with_phase: bool
     ) -> list[tuple[list[Wave], mi.Float]]:
-        thickness = self.thickness.at(si, active) * (self.outside * 1e3)
-        if self.scale.varies or self.scale.values[0] != 1:
-            thickness *= self.scale.at(si, active)
+        thickness = self.thickness.at(si, active) * self.scale.at(si, active) * (self.outside * 1e3)
         real, found = self.propagates and self.transparent and not with_phase, []
         for wavelength, n_s in zip(si.wavelengths, self.below.index(si, active), strict=True):
             n = self.film(wavelength) if isinstance(self.film, Dispersion) else mi.Complex2f(self.film, 0)

@@ -129,10 +129,23 @@ def test_textures_of_scales_are_read_at_the_point(llvm):
                 np.testing.assert_allclose(found, wanted, rtol=1e-4, atol=1e-4 * wanted.max())
 
 
-def test_a_lateral_scale_of_one_is_ignored(llvm):
-    bsdf = plugin(for_scales(SURFACES["blazed"](), 1), lateral_scale=1.0)
+@pytest.mark.parametrize("given", [{}, {"lateral_scale": 1.0}], ids=["default", "given"])
+def test_a_lateral_scale_of_one_costs_nothing_and_can_be_changed(llvm, given):
+    of = for_scales(SURFACES["blazed"](), 1)
+    bsdf = plugin(of, **given)
+    parameters, wo = mi.traverse(bsdf), near_orders(0.8, LINE)
     assert bsdf.layers.grating.scales.lateral is None
-    assert "lateral_scale" not in mi.traverse(bsdf)
+    parameters["lateral_scale"] = 0.8
+    parameters.update()
+    np.testing.assert_allclose(evaluate(bsdf, WI, wo)[0], evaluate(plugin(of, lateral_scale=0.8), WI, wo)[0], rtol=1e-5)
+
+
+def test_a_derivative_by_lengths_of_orders_that_overlap_is_refused(llvm):
+    parameters = mi.traverse(plugin(for_scales(SURFACES["blazed"](), 1, coherence_length=5.0)))
+    dr.enable_grad(parameters["lateral_scale"])
+    parameters.set_dirty("lateral_scale")
+    with pytest.raises(ValueError, match=r"lateral_scale: got \[1\] with a derivative, wanted 1: only of orders"):
+        parameters.update()
 
 
 @pytest.mark.parametrize("variant", ["llvm_ad_spectral_polarized"])
