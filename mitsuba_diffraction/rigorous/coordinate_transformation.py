@@ -52,6 +52,7 @@ Real = NDArray[np.float64]
 Complex = NDArray[np.complex128]
 
 SAMPLES = 4096
+_WALL_WIDTH = 1e-6  # in periods: no tilt admits vertical walls of both sides
 # At an edge the angle of the curve changes by more than both: radians, and multiples of the median over nine pixels.
 _MIN_EDGE_ANGLE, _MIN_EDGE_RATIO, _MAX_EDGES = 0.1, 8.0, 8
 # The speed of the curve in t at an edge is 1 − _GRADING of its mean; a piece of length l takes a fraction of t that is
@@ -99,10 +100,10 @@ def is_profile(height_field: HeightField) -> bool:
 def curve_of(height_field: HeightField) -> Curve:
     """Return the curve of a surface of one row: straight lines from pixel to pixel, continued across the tile boundary.
 
-    The steep facet of a sawtooth is thus one pixel wide, and so is the wall of a lamellar grating. Between edges the
-    length of the curve grows at a rate of 1 − η (4 cos 2πτ + cos 4πτ)/5: slowly near the edges, where fields are
-    singular (Granet 1999), and evenly away from them, as waves are short where the rate is high. Smooth bends count as
-    length (`_BEND_LENGTH`), so that sharp crests are resolved.
+    A step that is one pixel wide is a vertical wall (`_with_walls`). Between edges the length of the curve grows at a
+    rate of 1 − η (4 cos 2πτ + cos 4πτ)/5: slowly near the edges, where fields are singular (Granet 1999), and evenly
+    away from them, as waves are short where the rate is high. Smooth bends count as length (`_BEND_LENGTH`), so that
+    sharp crests are resolved.
     """
     rows = height_field.centred
     if not is_profile(height_field):
@@ -114,10 +115,9 @@ def curve_of(height_field: HeightField) -> Curve:
     n = rows.shape[1]
     x = (np.arange(n + 1) + 0.5) / n
     z = np.append(rows[0], rows[0, 0]) / period
-    angles = np.arctan2(np.diff(z), np.diff(x))
-    bends = np.abs(angles - np.roll(angles, 1))
-    min_angles = np.maximum(_MIN_EDGE_ANGLE, _MIN_EDGE_RATIO * median_filter(bends, 9, mode="wrap"))
-    edges = np.flatnonzero(bends > min_angles)
+    x, z = _with_walls(x, z)
+    angles, bends, is_edge = _bends(x, z)
+    bends, edges = np.abs(bends), np.flatnonzero(is_edge)
     edges = np.sort(edges[np.argsort(-bends[edges])[:_MAX_EDGES]])
     bends[edges] = 0
     steps = np.hypot(np.diff(x), np.diff(z))
@@ -132,6 +132,36 @@ def curve_of(height_field: HeightField) -> Curve:
     s = np.concatenate([[0.0], np.cumsum(steps)])
     at = _graded(s[edges], s[-1]) if len(edges) else np.linspace(0, s[-1], SAMPLES + 1)
     return Curve(np.interp(at, s, x), np.interp(at, s, z), -(angles.min() + angles.max()) / 2)
+
+
+def _bends(x: Real, z: Real) -> tuple[Real, Real, NDArray[np.bool_]]:
+    """Return the angles of the lines from each point to the next, by how much they change there, and where edges are.
+
+    Each is (n,), of n + 1 points, of which the last is the first of the next period.
+    """
+    angles = np.arctan2(np.diff(z), np.diff(x))
+    bends = angles - np.roll(angles, 1)
+    min_angles = np.maximum(_MIN_EDGE_ANGLE, _MIN_EDGE_RATIO * median_filter(np.abs(bends), 9, mode="wrap"))
+    return angles, bends, np.abs(bends) > min_angles
+
+
+def _with_walls(x: Real, z: Real) -> tuple[Real, Real]:
+    """Return the points with vertical walls, half way between two pixels, in place of steps that are one pixel wide.
+
+    A step has edges at both ends, one convex and one concave. The lines beside it are continued up to the wall.
+    """
+    angles, bends, is_edge = _bends(x, z)
+    right = is_edge & np.roll(is_edge, -1) & (bends * np.roll(bends, -1) < 0)
+    left = np.roll(right, 1)
+    slopes = np.where(right, 0, np.tan(angles))
+    reach = 0.5 / len(right) - _WALL_WIDTH / 2
+    # A pixel between two walls becomes two points at one height.
+    points = np.repeat(np.arange(len(right)), 1 + (left & right))
+    shift = reach * np.where(left, -1, right)[points]
+    shift[1:][np.diff(points) == 0] = reach
+    z = z[points] + shift * np.where(left, slopes, np.roll(slopes, 1))[points]
+    x = x[points] + shift
+    return np.append(x, x[0] + 1), np.append(z, z[0])
 
 
 def _graded(edges: Real, length: float) -> Real:
