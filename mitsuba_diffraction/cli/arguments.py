@@ -148,7 +148,8 @@ SCAN_OPTIONS: dict[str, Any] = {
     "fill_missing": Annotated[bool, typer.Option("--fill-missing", help="interpolate missing pixels of the scan")],
     "channel": Annotated[str | None, typer.Option(help="channel of the scan, by name or number")],
     "unit": Annotated[
-        list[str] | None, typer.Option(help="unit, for a scan without one; given twice: of lengths, then of heights")
+        list[str] | None,
+        typer.Option(help="unit, for a scan without one; given twice: of lengths, then of heights, in any scan"),
     ],
     "prepare": Annotated[list[str] | None, typer.Option(help=_STEPS)],
     "extent": Annotated[

@@ -11,7 +11,7 @@ scan = "skin.png"                # relative to the recipe; formats: readers.read
 pixel_size = 0.0586              # µm, one number or [x, y]; needed if the file has none, else overrides it
 height_range = 0.375             # µm, for integer images
 channel = "Height"               # name or number, in a file with several; default: the heights
-unit = "nm"                      # of a file without one; ["um", "nm"]: lateral, and of the heights
+unit = "nm"                      # of a file without one; ["um", "nm"]: lateral, and of the heights of any file
 prepare = [                      # steps of surface/prepare.py, in this order
     "level_plane",               # or "level_quadratic"
     "align_lines",               # remove offsets between rows

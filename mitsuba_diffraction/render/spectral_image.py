@@ -33,7 +33,10 @@ _LAYOUT_VERSION = "1.0"
 # Radiance is per nm, the unit in the channel names: the authors of the layout and pbrt-v4 omit the nm⁻¹, and
 # colour-science integrates the channels over wavelength.
 _UNITS = "W.m^-2.sr^-1"
-_CHANNEL = re.compile(r"S0\.(\d+(?:,\d+)?)nm")
+# The layout has decimal commas; other programs write points, too.
+_CHANNEL = re.compile(r"S0\.(\d+[.,]?\d*|[.,]\d+)([Ee][+-]?\d+)?([kMGTPmunp]?)(m|Hz)")
+_PREFIXES = {"k": 3, "M": 6, "G": 9, "T": 12, "P": 15, "": 0, "m": -3, "u": -6, "n": -9, "p": -12}
+_SPEED_OF_LIGHT = 299792458  # m/s
 # Header entries of OpenEXR and of the layout, which are not attributes.
 _RESERVED = frozenset(
     (
@@ -197,7 +200,8 @@ class SpectralImage:
 
         Raises:
             FileNotFoundError: if there is no such file.
-            ValueError: if it is not an OpenEXR file, not in this layout and version, or has no emissive channels in nm.
+            ValueError: if it is not an OpenEXR file, not in this layout and version, has no emissive channels, or one
+                with another name than a wavelength or a frequency.
         """
         import OpenEXR
 
@@ -214,13 +218,12 @@ class SpectralImage:
         for name, wanted in (("spectralLayoutVersion", _LAYOUT_VERSION), ("emissiveUnits", _UNITS)):
             if header.get(name) != wanted:
                 raise RequestError(f"{os.fspath(path)}: {name} is {header.get(name)!r}, wanted {wanted!r}")
-        found = sorted(
-            (float(match[1].replace(",", ".")), name)
-            for name in channels
-            if (match := _CHANNEL.fullmatch(name)) is not None
-        )
+        found = sorted((_wavelength(name, path), name) for name in channels if name.startswith("S0."))
         if not found:
             raise RequestError(f"{os.fspath(path)}: no channel like 'S0.405,000000nm'")
+        for (one, first), (other, second) in itertools.pairwise(found):
+            if one == other:
+                raise RequestError(f"{os.fspath(path)}: two channels of {one:g} nm, {first!r} and {second!r}")
         radiance = np.stack([channels[name].pixels for _, name in found], axis=-1)
         attributes = {
             name: value
@@ -229,6 +232,17 @@ class SpectralImage:
         }
         alpha = channels["A"].pixels.astype(np.float32) if "A" in channels else None
         return cls(np.array([wavelength for wavelength, _ in found]), radiance, attributes, alpha)
+
+
+def _wavelength(name: str, path: str | os.PathLike[str]) -> float:
+    """Return the wavelength in nm that an emissive channel names, in m or Hz with a prefix."""
+    if (match := _CHANNEL.fullmatch(name)) is None:
+        raise RequestError(f"{os.fspath(path)}: got the channel {name!r}, wanted one like 'S0.405,000000nm'")
+    number, exponent, prefix, unit = match.groups(default="")
+    value, power = float(number.replace(",", ".") + exponent), _PREFIXES[prefix]
+    if unit == "m":
+        return value * 10.0 ** (power + 9)
+    return _SPEED_OF_LIGHT * 10.0 ** (9 - power) / value if value else math.inf
 
 
 def stored_digest(path: str | os.PathLike[str]) -> str | None:

@@ -124,13 +124,33 @@ def write_exr(path, attributes, channels):
         ({}, ["R"], "spectralLayoutVersion is None, wanted '1.0'"),
         ({"spectralLayoutVersion": "2.0"}, ["R"], "'2.0'"),
         ({"spectralLayoutVersion": "1.0", "emissiveUnits": "lux"}, ["R"], "'lux'"),
-        ({"spectralLayoutVersion": "1.0", "emissiveUnits": "W.m^-2.sr^-1"}, ["T.500nm", "S0.5,0e14Hz"], "no channel"),
+        ({"spectralLayoutVersion": "1.0", "emissiveUnits": "W.m^-2.sr^-1"}, ["T.500nm", "S1.500nm"], "no channel"),
+        (
+            {"spectralLayoutVersion": "1.0", "emissiveUnits": "W.m^-2.sr^-1"},
+            ["S0.500nm", "S0.510 nm"],
+            r"a.exr: got the channel 'S0.510 nm', wanted one like 'S0.405,000000nm'",
+        ),
+        (
+            {"spectralLayoutVersion": "1.0", "emissiveUnits": "W.m^-2.sr^-1"},
+            ["S0.500nm", "S0.0,5um"],
+            r"a.exr: two channels of 500 nm, 'S0.0,5um' and 'S0.500nm'",
+        ),
     ],
 )
 def test_unknown_layouts_are_refused(attributes, channels, message, tmp_path):
     write_exr(tmp_path / "a.exr", attributes, channels)
     with pytest.raises(ValueError, match=message):
         SpectralImage.load(tmp_path / "a.exr")
+
+
+@pytest.mark.parametrize(
+    "name",
+    ["S0.500,5nm", "S0.500.5nm", "S0.0,5005um", "S0.5,005E2nm", "S0.5005e-10m", "S0.,5005um", "S0.598,985930THz"],
+)
+def test_channels_are_named_as_the_layout_allows(name, tmp_path):
+    # 299,792.458 nm THz / 500.5 nm = 598.985930… THz.
+    write_exr(tmp_path / "a.exr", {"spectralLayoutVersion": "1.0", "emissiveUnits": "W.m^-2.sr^-1"}, ["S0.400nm", name])
+    np.testing.assert_allclose(SpectralImage.load(tmp_path / "a.exr").wavelengths, [400, 500.5], rtol=1e-8)
 
 
 def test_unreadable_files_are_refused(image, tmp_path, capfd):

@@ -49,7 +49,7 @@ def tmd(comment):
     return head + sizes + (relief() / 1000).astype("<f4").tobytes()
 
 
-def sur(missing=(), streams=1):
+def sur(missing=(), streams=1, units=6 * ("µm",)):
     """Digital Surf, compressed: header of 512 bytes, a directory of streams, one zlib stream of int32."""
     step = 1e-4  # µm
     numbers = np.rint(relief() / step).astype("<i4")
@@ -68,7 +68,7 @@ def sur(missing=(), streams=1):
     header += struct.pack("<5h", 0, 0, 0, int(bool(missing)), 0) + struct.pack("<f4x", 0.0)
     header += struct.pack("<h5i", 32, lowest, highest, COLUMNS, ROWS, ROWS * COLUMNS)
     header += struct.pack("<3f", DX, DY, step)
-    header += text("X") + text("Y") + text("Z") + 6 * text("\xb5m")
+    header += text("X") + text("Y") + text("Z") + b"".join(map(text, units))
     header += struct.pack("<3f3h12x7hf", 1, 1, 1, 0, 0, 0, 0, 0, 0, 1, 1, 2020, 0, 0.0)
     header += (
         struct.pack("<I6x2h128x", len(data), 0, 0) + struct.pack("<5f", 0, 0, 0, 0, 0) + text("", 13) + text("", 13)

@@ -126,6 +126,153 @@ def test_a_cut_text_of_an_interferometer_gives_heights_or_one_line(name, write, 
         assert "\n" not in str(caught.value)
 
 
+SPIP = {"x-pixels": COLUMNS, "y-pixels": ROWS, "x-length": 1e3 * DX * COLUMNS, "y-length": 1e3 * DY * ROWS}
+
+
+def spip(missing=(), mark="=", scale=1e3, **fields):
+    """Text of SPIP: a header, heights by rows, and then, if any are void, where they are; lengths in nm."""
+    heights, void = foreign_scans.relief() * scale, np.zeros((ROWS, COLUMNS), int)
+    for at in missing:
+        heights[at], void[at] = 0, 1
+    fields = {**SPIP, "voidpixels": len(missing), **fields}
+    lines = ["# File Format = ASCII", *(f"# {name.replace('_', '-')} {mark}{value}" for name, value in fields.items())]
+    lines.append("# Start of Data:")
+    for table in (heights, void) if missing else (heights,):
+        lines += ["\t".join(f"{number:.6g}" for number in row) for row in table]
+    return "\n".join(lines)
+
+
+@pytest.mark.parametrize(
+    "settings",
+    [
+        {"z_unit": "nm"},
+        {"z_unit": " [nm]", "missing": MISSING},
+        {"z_unit": " µm", "scale": 1},
+        {"Bit2nm": 0.5, "scale": 2e3},
+        {"z_unit": "nm", "x_unit": "um", "y_unit": "um", "x_length": DX * COLUMNS, "y_length": DY * ROWS, "mark": ":"},
+    ],
+)
+@pytest.mark.parametrize("name", ["scan.asc", "scan.txt"])
+def test_text_of_spip_has_its_scale(settings, name, tmp_path):
+    settings = {name.replace("_length", "-length"): value for name, value in settings.items()}
+    (tmp_path / name).write_text(spip(**settings))
+    check(tmp_path / name, settings.get("missing", ()))
+
+
+@pytest.mark.parametrize(
+    ("settings", "message"),
+    [
+        ({}, "unit: the file names none for the heights"),
+        ({"z_unit": "V"}, "the heights: got the unit 'V'"),
+        ({"z_unit": "nm", "x-pixels": COLUMNS + 1}, f"got {ROWS * COLUMNS} numbers, wanted {ROWS} lines of"),
+        ({"z_unit": "nm", "x-length": "wide"}, "the header: got 'wide' for 'x-length'"),
+    ],
+)
+def test_wrong_text_of_spip_is_refused(settings, message, tmp_path):
+    (tmp_path / "scan.asc").write_text(spip(**settings))
+    with pytest.raises(ValueError, match=message):
+        read_height_field(tmp_path / "scan.asc")
+
+
+@pytest.mark.parametrize("names", [("Lateral units", "Value units"), ("Laterale Einheiten", "Werteinheiten")])
+@pytest.mark.parametrize("name", ["scan.xyz", "scan.txt"])
+def test_points_of_gwyddion_have_the_units_of_its_comments(names, name, tmp_path):
+    row, column = np.mgrid[:ROWS, :COLUMNS]
+    points = np.stack([1e-3 * DX * column, 1e-3 * DY * row, 1e-6 * foreign_scans.relief()], -1).reshape(-1, 3)
+    np.savetxt(tmp_path / name, points, header=f"Channel: Topography\n{names[0]}: mm\n{names[1]}: m", fmt="%.8g")
+    check(tmp_path / name)
+    (tmp_path / name).write_text((tmp_path / name).read_text().replace(f"{names[1]}: m", "Value units: V"))
+    with pytest.raises(ValueError, match="the heights: got the unit 'V'"):
+        read_height_field(tmp_path / name)
+
+
+def nanoscope_text(channels, quote="", lines=ROWS):
+    """Text of Nanoscope Analysis: its header, the names of channels, and a line of numbers for each pixel."""
+    header = f"""\\*File list
+\\Version: 0x09400000
+\\*Ciao scan list
+\\Scan Size: {DX * COLUMNS} ~m
+\\Samps/line: {COLUMNS}
+\\Lines: {ROWS}
+\\*Ciao image list
+\\Data offset: 81920
+\\Data length: {4 * ROWS * COLUMNS}
+\\Samps/line: {COLUMNS}
+\\Number of lines: {lines}
+\\Scan Size: {DX * COLUMNS} {DY * lines} ~m
+\\*File list end"""
+    numbers = np.stack(list(channels.values()), -1).reshape(-1, len(channels))
+    rows = ["\t".join(f"{number:.6f}" for number in pixel) for pixel in numbers]
+    return "\n".join([*(quote + line + quote for line in header.splitlines()), "\t".join(channels), *rows])
+
+
+@pytest.mark.parametrize("quote", ["", '"'])
+@pytest.mark.parametrize("name", ["scan.txt", "scan.export"])
+def test_text_of_nanoscope_analysis_is_no_binary_file(quote, name, tmp_path):
+    # Regression: not read as a file of Bruker Dimension (KeyError).
+    relief = foreign_scans.relief()
+    channels = {"Peak_Force_Error(nN)": relief, "Height_Sensor(nm)": 1e3 * relief, "Height(um)": 2 * relief}
+    (tmp_path / name).write_text(nanoscope_text(channels, quote), encoding="latin-1")
+    check(tmp_path / name)
+    assert read_height_field(tmp_path / name).source == f"{name}, Height_Sensor(nm)"
+    np.testing.assert_allclose(read_height_field(tmp_path / name, channel="Height(um)").heights, 2 * relief, atol=1e-5)
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        (nanoscope_text({"Height": foreign_scans.relief()}), "unit: the file names none for the heights"),
+        (nanoscope_text({"Error(V)": foreign_scans.relief()}), "wanted a channel of heights .* got 0 'Error"),
+        (nanoscope_text({"Height(nm)": foreign_scans.relief()}, lines=ROWS + 1), f"wanted {COLUMNS} × {ROWS + 1}"),
+        (nanoscope_text({"Height(nm)": np.ones((2, 2))}).replace("Samps/line", "Samples"), "'samps/line' is missing"),
+        (nanoscope_text({"Height(nm)": np.ones((2, 2))}).partition("\\*File list end")[0], "that is cut"),
+        (nanoscope_text({"Height(nm)": np.ones((2, 2))}).replace("(nm)", "(nm)\tPhase(deg)"), "1 numbers in a line"),
+    ],
+)
+def test_wrong_text_of_nanoscope_analysis_is_refused(text, message, tmp_path):
+    (tmp_path / "scan.txt").write_text(text)
+    with pytest.raises(ValueError, match=message) as caught:
+        read_height_field(tmp_path / "scan.txt")
+    assert "\n" not in str(caught.value)
+
+
+@needs_the_extra
+def test_digital_surf_without_lengths_is_read_in_those_given(tmp_path):
+    path = tmp_path / "scan.sur"
+    for units, given, message in (
+        (6 * ("a.u.",), "um", "unit: the file names none for its lengths"),
+        (2 * ("µm", "µm", "a.u."), "um", "unit: the file names none for the heights"),
+        (2 * ("a.u.", "a.u.", "µm"), ("um", "um"), "unit: the file names none for its lengths"),
+    ):
+        path.write_bytes(sur(units=units))
+        with pytest.raises(ValueError, match=message):
+            read_height_field(path)
+        field = read_height_field(path, unit=given)
+        assert field.pixel_size == pytest.approx((DX, DY))
+        np.testing.assert_allclose(field.heights, foreign_scans.relief(), atol=2e-5)
+
+
+@needs_the_extra
+@pytest.mark.parametrize(
+    ("name", "write"),
+    [
+        *(("scan.sur", sur), ("scan.asc", wyko), ("scan.xyz", zygo)),
+        ("scan.txt", lambda: nanoscope_text({"Height(nm)": 1e3 * foreign_scans.relief()}).encode("latin-1")),
+        ("spip.asc", lambda: spip(z_unit="nm").encode()),
+    ],
+)
+def test_the_second_unit_overrides_that_of_the_heights_in_a_file(name, write, tmp_path):
+    # Regression: the warning of an implausible scale named a remedy that was ignored.
+    (tmp_path / name).write_bytes(write())
+    plain = read_height_field(tmp_path / name)
+    for unit in ("cm", ("cm", "m")):
+        with pytest.warns(UserWarning, match=r"unit \(--unit um") if unit == ("cm", "m") else nullcontext():
+            field = read_height_field(tmp_path / name, unit=unit)
+        assert field.pixel_size == plain.pixel_size
+    ratio = field.height_range / plain.height_range
+    assert ratio in (pytest.approx(1e6), pytest.approx(1e9))
+
+
 @pytest.mark.slow
 @needs_the_extra
 def test_an_igor_wave_without_units_is_read_with_those_given(tmp_path):

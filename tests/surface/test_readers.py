@@ -1,7 +1,6 @@
 """Files to height fields: round trips of every format of the core, and one line for every misuse."""
 
 import struct
-import time
 import zlib
 from contextlib import nullcontext
 
@@ -13,7 +12,7 @@ from hypothesis import strategies as st
 from hypothesis.extra import numpy as npst
 from PIL import Image
 
-from mitsuba_diffraction.surface.readers import read_height_field
+from mitsuba_diffraction.surface.readers import gwyddion, read_height_field
 
 HEIGHTS = np.array([[0.0, 0.1, 0.25], [0.3, 0.2, 0.05]])
 """µm"""
@@ -553,6 +552,9 @@ def test_a_scan_of_an_impossible_scale_is_named(tmp_path, refuse, pixel, scale, 
         else:
             with pytest.warns(UserWarning, match=f"{name}: {fault}"):
                 read_height_field(tmp_path / name, pixel)
+    Image.fromarray(GREY).save(tmp_path / "scan.png")
+    with pytest.warns(UserWarning, match=r"right\? height_range \(--height-range\), in µm, sets another"):
+        read_height_field(tmp_path / "scan.png", 0.1, height_range=100)
     if scale < 1:
         field = read_height_field(tmp_path / "scan.tif", pixel, unit=("um", "m"))
         assert field.height_range == pytest.approx(0.3, rel=1e-5)
@@ -594,14 +596,13 @@ def in_field(inside):
         (in_field(b""), "data field of None"),
     ],
 )
-def test_gwy_files_with_wrong_sizes_are_refused_at_once(tmp_path, refuse, content, text):
+def test_gwy_files_with_wrong_sizes_are_refused(tmp_path, refuse, content, text):
     (tmp_path / "scan.gwy").write_bytes(content)
-    start = time.perf_counter()
     refuse("scan.gwy", text, unit="m")
-    assert time.perf_counter() - start < 5
 
 
-def test_gwy_of_great_depth_or_many_parts_is_parsed_at_once(tmp_path, refuse):
+def test_gwy_of_great_depth_or_many_parts_is_read_once_from_the_top(tmp_path, refuse, monkeypatch):
+    """Objects that are not needed are skipped, and each component is read once."""
     deep = b""
     for _ in range(5000):
         deep = component("b", "o", b"A\0" + struct.pack("<I", len(deep)) + deep)
@@ -609,9 +610,10 @@ def test_gwy_of_great_depth_or_many_parts_is_parsed_at_once(tmp_path, refuse):
     (tmp_path / "scan.gwy").write_bytes(
         gwy_bytes(component("a", "o", b"A\0" + struct.pack("<I", len(deep)) + deep) + many)
     )
-    start = time.perf_counter()
+    values, read = [], gwyddion._Bytes._value
+    monkeypatch.setattr(gwyddion._Bytes, "_value", lambda self, kind: (values.append(kind), read(self, kind))[1])
     refuse("scan.gwy", "got none")
-    assert time.perf_counter() - start < 5
+    assert values == ["o", *100_000 * "i"]
 
 
 # ---------------------------------------------------------------- Gwyddion's simple field
@@ -742,11 +744,10 @@ def test_lengths_of_a_header_without_a_unit_are_in_the_given_one(tmp_path):
 
 
 @pytest.mark.parametrize("width", ["a" + " " * 200_000 + "b", "1" * 200_000 + " x y"])
-def test_a_header_line_of_any_length_is_read_at_once(tmp_path, refuse, width):
+def test_a_header_line_of_any_length_is_read(tmp_path, refuse, width):
+    # In steps that grow with the square of the length, this would take hours.
     (tmp_path / "scan.asc").write_text(f"# Width: {width}\n# Height: 1 m\n1 2\n")
-    start = time.perf_counter()
     refuse("scan.asc", "the header: got", unit="m")
-    assert time.perf_counter() - start < 5
 
 
 def test_a_table_without_a_scale_is_refused(tmp_path, refuse):
@@ -780,7 +781,7 @@ def test_numbers_of_a_csv_are_read(tmp_path, refuse, name, mark):
     np.testing.assert_allclose(field.heights, 1e-3 * HEIGHTS)
     assert field.pixel_size == pytest.approx((0.1, 0.2))
     path.write_text(f"x [V]{mark}y [V]{mark}z [V]\n" + lines)
-    refuse(name, "unit: got the unit 'V'")
+    refuse(name, "its lengths: got the unit 'V'")
 
 
 def test_a_table_of_whole_decimal_commas_is_read_as_csv(tmp_path):

@@ -19,7 +19,7 @@ from ...errors import RequestError, is_number
 from ...files.writing import refuse_special
 from ...settings import Settings
 from ..heightfield import HeightField
-from . import gwyddion, images, instruments, interferometers, text, workarounds
+from . import gwyddion, images, instruments, interferometers, nanoscope, text, workarounds
 from .scan import Scan, micrometres, pair
 
 __all__ = ["read_height_field"]
@@ -34,6 +34,8 @@ _WITHOUT_UNIT = {
 }
 """Extension → reader of formats with heights in µm, or scaled by `height_range`."""
 
+# Extension → reader of formats with units and several channels.
+_WITH_CHANNELS = {".gwy": gwyddion.read_gwyddion, nanoscope.TEXT: nanoscope.read_text}
 # Extension → reader of single-channel formats with a unit.
 _WITH_UNIT = {
     ".gsf": gwyddion.read_simple_field,
@@ -56,18 +58,23 @@ _MAGIC = {
     b"II*\0": ".tif",
     b"MM\0*": ".tif",
     b"ncols ": ".asc",
+    b"# File Format = ASCII": ".asc",
+    b"# Daisy frame view": ".asc",
+    b'"\\*File list': nanoscope.TEXT,
     b"DIGITAL SURF": ".sur",
     b"DSCOMPRESSED": ".sur",
     b"Binary TrueMap": ".tmd",
     b"PK\3\4": ".x3p",
 } | interferometers.MAGIC
-_EXTENSIONS = (*_WITHOUT_UNIT, ".gwy", *_WITH_UNIT)
+_EXTENSIONS = (*_WITHOUT_UNIT, *_WITH_CHANNELS, *_WITH_UNIT)
 _OF_MANY_PROGRAMS = (".dat", ".asc", ".csv", ".txt", ".xyz")
 _HEADER_BYTES = 4096  # of a text
 
 # What a scan that diffracts light can be, µm; outside, a unit is wrong.
 _MIN_HEIGHT_RANGE, _MAX_HEIGHT_RANGE = 2e-4, Settings.largest_height_range
 _MIN_PIXEL, _MAX_PIXEL, _MAX_FIELD = 1e-4, 100.0, 5e4
+_UNITS = "unit (--unit um --unit m: lateral lengths in µm, heights in m)"
+_RANGE = "height_range (--height-range), in µm,"
 
 
 def read_height_field(
@@ -92,8 +99,9 @@ def read_height_field(
     | .tif | relief that `design` wrote | |
     | .tif, .tiff | Park Systems, with the extra `instruments` | |
     | .gwy, .gsf | Gwyddion, Gwyddion Simple Field | unit, if the file has none |
-    | .xyz | points x y z on a regular grid | unit |
-    | .asc, .txt | table of heights exported by Gwyddion, or ESRI grid | unit and pixel_size, if it has none |
+    | .xyz | points x y z on a regular grid | unit, if it has none |
+    | .asc, .txt | table of heights by Gwyddion, SPIP or Nanoscope Analysis, ESRI grid | unit and pixel_size, if it \
+        has none |
     | .asc, .xyz | Wyko ASCII, Zygo XYZ | |
     | .csv, .txt | points or a table of heights, after a line of names or none | unit; pixel_size of a table |
     | .spm, .000, .nid, .ibw, .sdf, .x3p, … | instrument formats, with the extra `instruments` | |
@@ -107,8 +115,8 @@ def read_height_field(
             and `filled` of the height field report their number.
         channel: of a file with several (.gwy and instrument formats), by name or number. None selects the one that
             holds lengths, or the first one named height or topography; `source` reports which.
-        unit: of lengths, e.g. "nm", for a file without one; ("um", "nm") if lateral lengths and heights differ.
-            `pixel_size` is in µm in any case.
+        unit: of lengths, e.g. "nm", for a file without one; ("um", "nm") if lateral lengths and heights differ, of
+            which the second overrides the unit in the file. `pixel_size` is in µm in any case.
         keep_missing: keep missing pixels as NaN, for the steps of `prepare`.
 
     Returns:
@@ -149,7 +157,7 @@ def read_height_field(
             raise RequestError("pixel_size: the file has none, wanted one number or (x, y) in µm")
         source = f"{path.name}, {scan.channel}" if scan.channel else path.name
         field = HeightField(heights, pixel_size, source, fill_missing=fill_missing, keep_missing=keep_missing)
-        _check_scale(field, levelled=not keep_missing)
+        _check_scale(field, not keep_missing, _RANGE if integers else _UNITS)
     # Pillow raises OSError for a damaged image, the system for unreadable paths (a folder, permissions).
     except (RequestError, OSError, MemoryError) as error:
         raise RequestError(" ".join(f"{path}: {str(error)[:_MAX_QUOTE]}".split())) from error
@@ -158,7 +166,7 @@ def read_height_field(
     return field
 
 
-def _check_scale(field: HeightField, levelled: bool) -> None:
+def _check_scale(field: HeightField, levelled: bool, remedy: str) -> None:
     """Refuse pixels or a size that no scan has, and warn of such heights; one still to be levelled may be tilted."""
     (x, y), size = field.pixel_size, max(field.tile_size)
     if not (min(x, y) >= _MIN_PIXEL and max(x, y) <= _MAX_PIXEL and size <= _MAX_FIELD):
@@ -171,8 +179,7 @@ def _check_scale(field: HeightField, levelled: bool) -> None:
     if 0 < height_range < _MIN_HEIGHT_RANGE or (levelled and height_range > _MAX_HEIGHT_RANGE):
         warnings.warn(
             f"{field.source}: got heights of a range of {height_range:.3g} µm, wanted {_MIN_HEIGHT_RANGE:g} to "
-            f"{_MAX_HEIGHT_RANGE:g} µm: is their unit right? unit (--unit um --unit m: lateral lengths in µm, heights "
-            "in m) sets it for a file without one",
+            f"{_MAX_HEIGHT_RANGE:g} µm: is their unit right? {remedy} sets another",
             stacklevel=3,
         )
 
@@ -192,12 +199,12 @@ def _read(path: Path, channel: str | int | None, unit: str | tuple[str, str] | N
         )
     if path.stat().st_size == 0:
         raise RequestError("the file is empty")
-    if channel is not None and not (instrument or extension == ".gwy"):
+    if channel is not None and not (instrument or extension in _WITH_CHANNELS):
         raise RequestError(f"channel: got {channel!r} for {extension}, which holds one only")
     if instrument:
         return instruments.read_instrument(path, unit, channel, extension)
-    if extension == ".gwy":
-        return gwyddion.read_gwyddion(path, unit, channel)
+    if extension in _WITH_CHANNELS:
+        return _WITH_CHANNELS[extension](path, unit, channel)
     if extension in _WITH_UNIT:
         return _WITH_UNIT[extension](path, unit)
     read = _WITHOUT_UNIT[extension](path)
@@ -220,6 +227,8 @@ def _extension_of_content(path: Path) -> str:
     if text.is_gwyddion_export(start):
         return ".asc"
     found = next((extension for magic, extension in _MAGIC.items() if start.startswith(magic)), path.suffix.lower())
+    if found == ".spm" and nanoscope.is_text(path):
+        return nanoscope.TEXT
     return ".jpk-qi-data" if found == ".x3p" and workarounds.is_jpk(path) else found
 
 

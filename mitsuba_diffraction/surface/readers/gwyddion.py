@@ -58,9 +58,9 @@ def read_gwyddion(path: Path, unit: str | tuple[str, str] | None, channel: str |
     units = {n: _unit(field, "si_unit_z") for n, field in fields.items()}
     channels = [Channel(n, titles.get(n, "untitled"), scan.is_length(z) or not z) for n, z in sorted(units.items())]
     chosen = choose_channel(channels, channel)
-    field, (given_along, given_high) = fields[chosen.number], scan.pair(unit)
-    high = scan.scale(units[chosen.number], given_high, "the heights")
-    along = scan.scale(_unit(field, "si_unit_xy"), given_along, "the width")
+    field = fields[chosen.number]
+    high = scan.scale_of_heights(units[chosen.number], unit)
+    along = scan.scale(_unit(field, "si_unit_xy"), scan.pair(unit)[0], "the width")
     heights, size = _heights(field)
     rows, columns = heights.shape
     return Scan(heights * high, (size[0] * along / columns, size[1] * along / rows), chosen.name)
@@ -170,11 +170,10 @@ def read_simple_field(path: Path, unit: str | tuple[str, str] | None) -> Scan:
             raise RequestError(f"got {size} bytes, wanted {start + 4 * rows * columns} for {columns} × {rows} pixels")
         file.seek(start)
         numbers = np.frombuffer(file.read(4 * rows * columns), "<f4").reshape(rows, columns)
-    along, high = scan.pair(unit)
-    heights = numbers.astype(np.float64) * scan.scale(fields.get("ZUnits", ""), high, "the heights")
+    heights = numbers.astype(np.float64) * scan.scale_of_heights(fields.get("ZUnits", ""), unit)
     pixel_size = None
     if "XReal" in fields and "YReal" in fields:
-        scale = scan.scale(fields.get("XYUnits", ""), along, "the width")
+        scale = scan.scale(fields.get("XYUnits", ""), scan.pair(unit)[0], "the width")
         pixel_size = (_length(fields, "XReal") * scale / columns, _length(fields, "YReal") * scale / rows)
     return Scan(heights, pixel_size, fields.get("Title", ""))
 

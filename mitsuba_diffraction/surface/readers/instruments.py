@@ -61,7 +61,7 @@ def read_instrument(path: Path, unit: str | tuple[str, str] | None, channel: str
         if name != "jpk":  # of whose archives one member is read
             _refuse_bomb(path)
         library = lookup_reader_by_format[name]
-        contents, doubts = workarounds.rewritten(path, name)
+        contents, doubts, has_unit_of_heights = workarounds.rewritten(path, name)
         try:
             found = {c.index: c for c in library(contents).channels}
             chosen = choose_channel(
@@ -75,10 +75,9 @@ def read_instrument(path: Path, unit: str | tuple[str, str] | None, channel: str
             if 8 * int(np.prod(source.nb_grid_pts, dtype=object)) > MAX_ARRAY_BYTES:
                 raise RequestError(f"got {source.nb_grid_pts} pixels, wanted at most {MAX_ARRAY_BYTES} bytes")
             given, own = scan.pair(unit), source.unit or ""
-            along, high = (scan.scale(own, one, "its lengths") for one in given)
-            if name == "ibw" and not workarounds.ibw_has_unit(contents):
-                high = scan.scale("", given[1], "the heights")
-            topography = source.topography() if own else source.topography(unit=given[0])
+            along = scan.scale(own, given[0], "its lengths")
+            high = scan.scale_of_heights(own if has_unit_of_heights else "", unit)
+            topography = source.topography() if source.unit is not None else source.topography(unit=given[0])
             heights: NDArray[np.float64] = np.ma.asarray(topography.heights(), np.float64).T
             size = topography.physical_sizes
         except RequestError:

@@ -36,7 +36,7 @@ _ZYGO_LINES = 13
 
 def read_wyko(path: Path, unit: str | tuple[str, str] | None) -> Scan:
     """Read the first block of heights of a Wyko ASCII file."""
-    scan.pair(unit)
+    high = scan.scale_of_heights("nm", unit)
     first, *lines = text.contents(path).splitlines()
     fields: dict[str, str] = {}
     at = 0
@@ -60,12 +60,12 @@ def read_wyko(path: Path, unit: str | tuple[str, str] | None) -> Scan:
     if "Pixel_size" in fields:
         along_x = 1e3 * _number(fields, "Pixel_size")
         pixel_size = along_x, along_x * _number(fields, "Aspect", "1")
-    return Scan(1e-3 * heights.T[::-1], pixel_size, fields.get("Title", ""))
+    return Scan(high * heights.T[::-1], pixel_size, fields.get("Title", ""))
 
 
 def read_zygo(path: Path, unit: str | tuple[str, str] | None) -> Scan:
     """Read the points of a Zygo XYZ file."""
-    scan.pair(unit)
+    high = scan.scale_of_heights("um", unit)
     first, *lines = (line.strip() for line in text.contents(path).splitlines())
     if "XYZ" not in first:
         raise RequestError(
@@ -87,7 +87,7 @@ def read_zygo(path: Path, unit: str | tuple[str, str] | None) -> Scan:
         raise RequestError(f"got {len(points)} points, wanted {columns} × {rows}")
     heights, (d_x, d_y) = text.gridded(points)
     pixel_size = (resolution * d_x, resolution * d_y) if np.isfinite(resolution) and resolution > 0 else None
-    return Scan(heights, pixel_size)
+    return Scan(heights * high, pixel_size)
 
 
 def _number(fields: dict[str, str], name: str, otherwise: str = "none") -> float:

@@ -1,16 +1,27 @@
-"""Headers of Nanoscope files (.spm, .000, …): the lines of an image, and its length along the slow axis.
+"""Headers of Nanoscope files (.spm, .000, …), and the text that Nanoscope Analysis exports.
 
 A header has a section for the scan as it was set, and one for each image. `Aspect Ratio` is width to length. Where it
 is not 1:1, and there is no `Slow Axis Size`, the two equal numbers of `Scan Size` are the sides of the square of which
 a part was scanned. If a scan was stopped, they are the sides of the whole scan. The library takes them for the sides of
 the image. Where the lines of an image do not fit its data, it takes the lines that were set.
+
+The text has the same header, whose lines may be in quotes, then the names of one or more channels, with their units, as
+in "Height_Sensor(nm)", and a line of numbers for each pixel, row by row.
 """
 
 from __future__ import annotations
 
 import re
+from itertools import dropwhile
+from pathlib import Path
 from typing import NamedTuple
 
+from ...errors import RequestError
+from . import scan, text
+from .scan import Channel, Scan, choose_channel
+
+TEXT = ".txt of Nanoscope"
+"""In the place of an extension."""
 _END = re.compile(rb"\\\*File list end[^\n]*", re.IGNORECASE)
 _SET = ("ciao scan list", "afm list", "stm list", "nc afm list")
 _IMAGES = ("ciao image list", "afm image list", "stm image list", "ncafm image list", "image list")
@@ -32,17 +43,8 @@ def rewritten_nanoscope(data: bytes) -> tuple[bytes, list[str]]:
     if (end := _END.search(data)) is None:
         return data, []
     lines = data[: end.end()].decode("latin-1").splitlines()
-    sections: list[tuple[str, dict[str, str], dict[str, int]]] = []
-    for number, line in enumerate(lines):
-        name, _, value = line.strip().removeprefix("\\").partition(": ")
-        if name.startswith("*"):
-            sections.append((name[1:].lower(), {}, {}))
-        elif sections:
-            sections[-1][1][name.lower()], sections[-1][2][name.lower()] = value.strip(), number
-    settings: dict[str, str] = {}
-    for section, fields, _ in sections:
-        if section in _SET:
-            settings |= fields
+    sections = _sections(lines)
+    settings = _settings(sections)
     shift = 2 * end.end() + 2**10  # of the data, behind a header that becomes a little longer
     doubts = []
     for section, fields, at in sections:
@@ -59,6 +61,62 @@ def rewritten_nanoscope(data: bytes) -> tuple[bytes, list[str]]:
         doubts.append(image.doubt)
     header = "\r\n".join([*lines, ""]).encode("latin-1")
     return header.ljust(shift, b"\0") + data, doubts
+
+
+def is_text(path: Path) -> bool:
+    """Return whether a file that begins as one of Nanoscope is a text: in others, zero bytes follow the header."""
+    return b"\0" not in path.read_bytes()
+
+
+def read_text(path: Path, unit: str | tuple[str, str] | None, channel: str | int | None) -> Scan:
+    """Read a channel of the text of Nanoscope Analysis; its first row is row 0."""
+    lines = [line.strip('" ') for line in text.contents(path).splitlines()]
+    body = [line for line in dropwhile(lambda line: line.lower() != "\\*file list end", lines) if line][1:]
+    if not body:
+        raise RequestError("a text of Nanoscope that is cut, wanted a header that ends, names of channels, and numbers")
+    units = [match[1] if (match := text.BRACKETS.search(name)) else "" for name in body[0].split()]
+    names = zip(body[0].split(), units, strict=True)
+    channels = [Channel(k, name, scan.is_length(own) or not own) for k, (name, own) in enumerate(names)]
+    chosen = choose_channel(channels, channel)
+    table = text.parse_table("\n".join(body[1:]))
+    if table.shape[1] != len(channels):
+        raise RequestError(f"got {table.shape[1]} numbers in a line, wanted {len(channels)}: {body[0][:60]}")
+    sections = _sections(lines)
+    images = [fields for section, fields, _ in sections if section in _IMAGES]
+    try:
+        # As if a number were a byte.
+        count = {"data length": str(len(table)), "bytes/pixel": "1"}
+        image = _image(images[0] | count, _settings(sections), 0)
+    except (KeyError, ValueError, IndexError, ZeroDivisionError, OverflowError) as error:
+        raise RequestError(f"the header of a text of Nanoscope: {error} is missing or wrong in an image list") from None
+    if image.columns * image.lines != len(table):
+        raise RequestError(f"got {len(table)} pixels, wanted {image.columns} × {image.lines}")
+    heights = table[:, chosen.number].reshape(image.lines, image.columns)
+    along = scan.scale(image.unit.replace("~", "µ"), scan.pair(unit)[0], "the width")
+    high = scan.scale_of_heights(units[chosen.number], unit)
+    pixel_size = image.width * along / image.columns, image.length * along / image.lines
+    return Scan(heights * high, pixel_size, chosen.name, image.doubt)
+
+
+def _sections(lines: list[str]) -> list[tuple[str, dict[str, str], dict[str, int]]]:
+    """Return, of each section of a header, its name, its fields and their lines, all names in lower case."""
+    sections: list[tuple[str, dict[str, str], dict[str, int]]] = []
+    for number, line in enumerate(lines):
+        name, _, value = line.strip().removeprefix("\\").partition(": ")
+        if name.startswith("*"):
+            sections.append((name[1:].lower(), {}, {}))
+        elif sections:
+            sections[-1][1][name.lower()], sections[-1][2][name.lower()] = value.strip(), number
+    return sections
+
+
+def _settings(sections: list[tuple[str, dict[str, str], dict[str, int]]]) -> dict[str, str]:
+    """Return the fields of the scan as it was set."""
+    settings: dict[str, str] = {}
+    for section, fields, _ in sections:
+        if section in _SET:
+            settings |= fields
+    return settings
 
 
 def _image(fields: dict[str, str], settings: dict[str, str], version: int) -> _Image:
@@ -80,7 +138,7 @@ def _image(fields: dict[str, str], settings: dict[str, str], version: int) -> _I
     set_columns, set_lines = (_number(settings.get(name, "0")) for name in ("samps/line", "lines"))
     # What the settings yield for the lines of the image, if these are as far apart as those that were set.
     part = lines / columns * set_columns / set_lines if set_columns and set_lines else lines / columns
-    expected = [width / set_aspect * part] if set_columns and set_lines else []
+    expected = [width / set_aspect * part] if set_columns and set_lines and _aspect(settings) else []
     if width == length and not refilled:
         expected.append(width / aspect)
         square_pixels = width * lines / columns

@@ -48,6 +48,12 @@ def scale(own: str, given: str, what: str) -> float:
     return micrometres(own or given, what)
 
 
+def scale_of_heights(own: str, unit: str | tuple[str, str] | None, what: str = "the heights") -> float:
+    """Return the unit of the heights in µm: the second of two given ones, or that of the file, or the given one."""
+    given = pair(unit)[1]
+    return scale(own if unit is None or isinstance(unit, str) else "", given, what)
+
+
 def pair(unit: str | tuple[str, str] | None) -> tuple[str, str]:
     """Return the given units of lateral lengths and heights; empty if none."""
     if unit is None:

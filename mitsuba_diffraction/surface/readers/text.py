@@ -1,7 +1,8 @@
 """Heights as text: points x y z (.xyz), and a table of heights with or without a header (.asc).
 
 .xyz: three numbers per line, points in any order, on a regular grid along x and y; a grid position without a point is a
-missing pixel. Lines that begin with # are comments. Row 0 has the smallest y.
+missing pixel. Lines that begin with # are comments; in two of them, Gwyddion writes the units of lengths and of heights
+("# Lateral units: m", "# Value units: m"). Row 0 has the smallest y.
 
 .asc: a table of heights, starting with the top row of the image, with one of these headers:
 
@@ -17,6 +18,14 @@ missing pixel. Lines that begin with # are comments. Row 0 has the smallest y.
     cellsize 0.05
     NODATA_value -9999
 
+    # File Format = ASCII             of SPIP
+    # x-pixels = 512
+    # y-pixels = 512
+    # x-length = 5000                 nm, or `x-unit`
+    # y-length = 5000
+    # z-unit = [nm]                   or, without it, Bit2nm
+    # voidpixels = 0                  if any, a second table follows, in which they are 1
+
 or without a header, if pixel size and unit are given as arguments.
 
 .csv, .txt: either of them, points if there are three columns on a grid. A first line of names is skipped; it may hold
@@ -29,6 +38,7 @@ import io
 import re
 import warnings
 from contextlib import suppress
+from itertools import pairwise
 from pathlib import Path
 
 import numpy as np
@@ -41,21 +51,35 @@ from .scan import MAX_ARRAY_BYTES, Scan
 _MAX_GRID_DEVIATION = 0.1  # of a coordinate, in pixels, owing to rounding in text
 _MIN_POINT_FRACTION = 0.25  # of grid positions that have a point
 _GWYDDION = "Channel", "Width", "Height", "Value units"
+_SPIP_LINE = re.compile(r"#\s*([\w-]+)\s*[=:](.*)")
 _HEADER_LINE = re.compile(r"#\s*([^:\uff1a#]+?)\s*[:\uff1a](.*)")
 _LENGTH = re.compile(r"([-+.,\deE]*)(.*)")
-_BRACKETS = re.compile(r"[\[(]([^\])]*)[\])]\s*$")
+BRACKETS = re.compile(r"[\[(]([^\])]*)[\])]\s*$")
 _NUMBER = re.compile(r"[-+.]*\d|[-+]?(nan|inf)", re.IGNORECASE)
 _DECIMAL_COMMA = re.compile(r"[-+]?\d+,\d+(?:[eE][-+]?\d+)?")
+_SPIP = {"x-pixels", "y-pixels", "x-length", "y-length"}
 _ESRI = ("ncols", "nrows", "xllcorner", "yllcorner", "xllcenter", "yllcenter", "cellsize", "nodata_value")
 
 
 def read_points(path: Path, unit: str | tuple[str, str] | None) -> Scan:
     """Read points x y z on a regular grid."""
-    return _points(parse_table(contents(path)), unit)
+    text = contents(path)
+    return _points(parse_table(text), unit, _units_of_points(text))
 
 
-def _points(points: NDArray[np.float64], unit: str | tuple[str, str] | None) -> Scan:
-    along, high = (scan.scale("", given, "its lengths") for given in scan.pair(unit))
+def _units_of_points(text: str) -> tuple[str, str]:
+    """Return the units that two successive comments name, in any language; empty if none do."""
+    lines = _header_lines(text)
+    for (_, along), (name, high) in pairwise(lines):
+        if scan.is_length(along) and (scan.is_length(high) or name == "Value units"):
+            return along, high
+    return "", ""
+
+
+def _points(points: NDArray[np.float64], unit: str | tuple[str, str] | None, units: tuple[str, str] = ("", "")) -> Scan:
+    """Put points on their grid; `units` are those of the file."""
+    along = scan.scale(units[0], scan.pair(unit)[0], "its lengths")
+    high = scan.scale_of_heights(units[1], unit)
     heights, (d_x, d_y) = gridded(points)
     pixel_size = (d_x * along, d_y * along) if d_x and d_y else None  # a single line determines only one of them
     doubt = ""
@@ -86,13 +110,15 @@ def read_csv(path: Path, unit: str | tuple[str, str] | None) -> Scan:
     text = contents(path)
     first, _, rest = text.lstrip().partition("\n")
     names = [name.strip(' "') for name in re.split("[;,\t]", first)]
+    units = _units_of_points(text)
     if not any(_NUMBER.match(name) for name in names) and not first.startswith("#"):
         text = rest
-        units = [match[1].strip() for name in names if (match := _BRACKETS.search(name))]
-        if len(units) == len(names) and len({*units[:2]}) == 1:
-            unit = units[0], units[-1]
+        named = [match[1].strip() for name in names if (match := BRACKETS.search(name))]
+        if len(named) == len(names) and len({*named[:2]}) == 1:
+            units = named[0], named[-1]
     numbers = parse_table(text)
-    return _points(numbers, unit) if numbers.shape[1] == 3 and _may_be_points(numbers) else _heights(text, unit)
+    is_points = numbers.shape[1] == 3 and _may_be_points(numbers)
+    return _points(numbers, unit, units) if is_points else _heights(text, unit, units[1])
 
 
 def read_table(path: Path, unit: str | tuple[str, str] | None) -> Scan:
@@ -100,16 +126,20 @@ def read_table(path: Path, unit: str | tuple[str, str] | None) -> Scan:
     return _heights(contents(path), unit)
 
 
-def _heights(text: str, unit: str | tuple[str, str] | None) -> Scan:
+def _heights(text: str, unit: str | tuple[str, str] | None, own: str = "") -> Scan:
+    """Read a table of heights; `own` is their unit in a file without a header."""
     if text.lstrip()[:5].lower() == "ncols":
         return _esri(text, unit)
+    spip = {match[1].lower(): match[2].strip() for line in text.splitlines() if (match := _SPIP_LINE.match(line))}
+    if spip.keys() >= _SPIP:
+        return _spip(spip, parse_table(text), unit)
     header = _gwyddion_header(text)
     heights = parse_table(text)
     rows, columns = heights.shape
     if not header and columns == 3 and _may_be_points(heights):
         raise RequestError("three numbers a line that may be points x y z: wanted the extension .xyz for points")
-    along, high = scan.pair(unit)
-    scale = scan.scale(header.get("Value units", ""), high, "the heights")
+    along, _ = scan.pair(unit)
+    scale = scan.scale_of_heights(header.get("Value units", own), unit)
     pixel_size = None
     if "Width" in header and "Height" in header:
         pixel_size = (_length(header["Width"], along) / columns, _length(header["Height"], along) / rows)
@@ -118,7 +148,7 @@ def _heights(text: str, unit: str | tuple[str, str] | None) -> Scan:
 
 def _gwyddion_header(text: str) -> dict[str, str]:
     """Return what the comments of Gwyddion's export say, by the English names of `_GWYDDION`."""
-    lines = [(match[1], match[2].strip()) for line in text.splitlines() if (match := _HEADER_LINE.match(line))]
+    lines = _header_lines(text)
     found = {name: value for name, value in lines if name in _GWYDDION and value}
     if "Width" in found:
         return found
@@ -128,6 +158,37 @@ def _gwyddion_header(text: str) -> dict[str, str]:
         if _has_unit(values[1]) and _has_unit(values[2]) and not _has_unit(values[0]):
             return {name: value for name, value in zip(_GWYDDION, values, strict=True) if value}
     return found
+
+
+def _header_lines(text: str) -> list[tuple[str, str]]:
+    """Return name and value of each comment "# name: value"."""
+    return [(match[1], match[2].strip()) for line in text.splitlines() if (match := _HEADER_LINE.match(line))]
+
+
+def _spip(header: dict[str, str], table: NDArray[np.float64], unit: str | tuple[str, str] | None) -> Scan:
+    """Return the scan of SPIP's header, by the names in it in lower case."""
+
+    def number(name: str) -> float:
+        try:
+            return abs(float(header[name]))
+        except ValueError:
+            raise RequestError(f"the header: got {header[name][:60]!r} for {name!r}, wanted a number") from None
+
+    columns, rows = int(number("x-pixels")), int(number("y-pixels"))
+    tables = 2 if header.get("voidpixels") not in (None, "", "0") else 1
+    if table.size != tables * columns * rows:
+        raise RequestError(f"got {table.size} numbers, wanted {rows} lines of {columns}, {tables} of each")
+    heights, *void = table.reshape(tables, rows, columns)
+    if void:
+        heights = np.where(void[0] == 1, np.nan, heights)
+    along, _ = scan.pair(unit)
+    own, steps = header.get("z-unit", "").strip("[]"), 1.0
+    if not own and "bit2nm" in header:
+        own, steps = "nm", number("bit2nm")
+    width, length = (
+        number(f"{axis}-length") * scan.scale(header.get(f"{axis}-unit", "nm"), along, f"{axis}-unit") for axis in "xy"
+    )
+    return Scan(heights * (steps * scan.scale_of_heights(own, unit)), (width / columns, length / rows))
 
 
 def is_gwyddion_export(start: bytes) -> bool:
@@ -235,5 +296,7 @@ def _length(text: str, unit: str) -> float:
     try:
         value = float(number.replace(",", "."))
     except ValueError:
-        raise RequestError(f"the header: got the length {text[:60]!r}, wanted a number and a unit") from None
+        value = np.nan
+    if not np.isfinite(value):
+        raise RequestError(f"the header: got the length {text[:60]!r}, wanted a number and a unit")
     return value * scan.micrometres(own.strip() or unit, "the header")

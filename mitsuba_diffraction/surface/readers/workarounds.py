@@ -3,7 +3,8 @@
 - .tmd: the comment has any length; the library reads 24 bytes.
 - .x3p (ISO 25178-72): a zipped folder, heights as text in main.xml, empty offsets, invalid dates, and dashes in the
   revision are common; the library accepts none of them.
-- .sur: since 2010 the data may be compressed by zlib (DSCOMPRESSED).
+- .sur: since 2010 the data may be compressed by zlib (DSCOMPRESSED). The library refuses units that it does not know,
+  as "a.u.".
 - .ibw: a wave of two dimensions is an image, unless its columns have names; the library wants it to be square. Heights
   may have no unit.
 - .spm, .000: lines and length of a part of a scan (`nanoscope`).
@@ -20,22 +21,24 @@ import posixpath
 import struct
 import zipfile
 import zlib
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from contextlib import suppress
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 from xml.etree import ElementTree
 
 import numpy as np
 from numpy.typing import NDArray
 
 from ...errors import RequestError
-from . import nanoscope
+from . import nanoscope, scan
 from .scan import MAX_ARRAY_BYTES
 
 _TMD_COMMENT = 24  # bytes, of the only comment that the library reads
 _SUR_HEADER, _SUR_SIZES = 512, struct.Struct("<2h")  # lengths of comment and private data, at `_SUR_AT`
 _SUR_AT = 334
+# Units of x, y and heights, of their steps, then of the axes: six texts of 16 bytes.
+_SUR_UNITS, _SUR_UNIT = 180, 16
 _NMS_HEADER = 3468
 _IBW_HEADER = 384
 _IBW_LABELS, _IBW_DIMENSIONS, _IBW_UNIT = 36, 132, 212  # offsets of four int32, of four int32, of a text
@@ -43,21 +46,38 @@ _JPK_GRID = ("ScanWidth", "ScanLength")  # pixels, by the library's names
 _JPK_IMAGES = ("data-image.jpk-qi-image", "data-image.force")
 
 
-def rewritten(path: Path, name: str) -> tuple[str | io.BytesIO, list[str]]:
-    """Return the path, or the contents, of a file of the format `name` for the library, and `Scan.doubt` by channel.
+class Rewritten(NamedTuple):
+    """A file for the library.
+
+    Attributes:
+        contents: the path, or the bytes.
+        doubts: `Scan.doubt` by channel.
+        has_unit_of_heights: if not, the library takes the unit of the surface.
+    """
+
+    contents: str | io.BytesIO
+    doubts: Sequence[str] = ()
+    has_unit_of_heights: bool = True
+
+
+def rewritten(path: Path, name: str) -> Rewritten:
+    """Return a file of the format `name` for the library.
 
     Raises:
         RequestError: if the file is not of this format.
     """
     if name == "jpk" and zipfile.is_zipfile(path):
-        return io.BytesIO(_jpk_image(path)), []
+        return Rewritten(io.BytesIO(_jpk_image(path)))
     if name not in (*_REWRITE, "di"):
-        return str(path), []
+        return Rewritten(str(path))
     if path.stat().st_size > MAX_ARRAY_BYTES:
         raise RequestError(f"got {path.stat().st_size} bytes, wanted at most {MAX_ARRAY_BYTES}")
     data = path.read_bytes()
-    data, doubts = nanoscope.rewritten_nanoscope(data) if name == "di" else (_REWRITE[name](data), [])
-    return io.BytesIO(data), doubts
+    if name == "di":
+        data, doubts = nanoscope.rewritten_nanoscope(data)
+        return Rewritten(io.BytesIO(data), doubts)
+    has_unit = {"sur": _sur_has_units(data)[2], "ibw": len(data) > _IBW_UNIT and data[_IBW_UNIT] != 0}.get(name, True)
+    return Rewritten(io.BytesIO(_REWRITE[name](data)), has_unit_of_heights=has_unit)
 
 
 def is_jpk(path: Path) -> bool:
@@ -92,6 +112,7 @@ def _tmd(data: bytes) -> bytes:
 
 
 def _sur(data: bytes) -> bytes:
+    data = _with_known_units(data)
     if not data.startswith(b"DSCOMPRESSED") or len(data) < _SUR_HEADER + 4:
         return data
     start = _SUR_HEADER + sum(_SUR_SIZES.unpack_from(data, _SUR_AT))
@@ -107,6 +128,27 @@ def _sur(data: bytes) -> bytes:
     except (struct.error, zlib.error) as error:
         raise RequestError(f"a compressed Digital Surf file whose heights cannot be decompressed ({error})") from None
     return b"DIGITAL SURF" + data[12:start] + b"".join(streams)
+
+
+def _sur_units(data: bytes) -> list[bytes]:
+    return [data[at : at + _SUR_UNIT] for at in range(_SUR_UNITS, _SUR_UNITS + 6 * _SUR_UNIT, _SUR_UNIT)]
+
+
+def _sur_has_units(data: bytes) -> list[bool]:
+    """Return whether each unit is a length."""
+    # In old files, "æ" is the micro sign of MS-DOS.
+    units = (unit.decode("latin-1").strip(" \0").replace("æ", "µ") for unit in _sur_units(data))
+    return [scan.is_length(unit) for unit in units]
+
+
+def _with_known_units(data: bytes) -> bytes:
+    """Return a file whose units are lengths, those of the heights like those of the surface, or else none at all."""
+    units, (x, y, z, *_) = _sur_units(data), _sur_has_units(data)
+    if not (x and y):
+        units = 6 * [bytes(_SUR_UNIT)]
+    elif not z:
+        units[2:] = 4 * units[:1]
+    return data[:_SUR_UNITS] + b"".join(units) + data[_SUR_UNITS + 6 * _SUR_UNIT :]
 
 
 def _x3p(data: bytes) -> bytes:
@@ -166,11 +208,6 @@ def _ibw(data: bytes) -> bytes:
 
 
 _REWRITE: dict[str, Callable[[bytes], bytes]] = {"tmd": _tmd, "sur": _sur, "x3p": _x3p, "ibw": _ibw}
-
-
-def ibw_has_unit(contents: str | io.BytesIO) -> bool:
-    """Return whether an Igor wave has a unit of the heights. Without one, the library takes the unit of the surface."""
-    return not isinstance(contents, io.BytesIO) or contents.getbuffer()[_IBW_UNIT] != 0
 
 
 def ibw(note: dict[str, str], size: tuple[float, float], shape: tuple[int, int]) -> str:
