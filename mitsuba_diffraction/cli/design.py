@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from pathlib import Path
 from typing import Annotated
 
@@ -15,14 +16,17 @@ from ..files.picture_file import read_picture
 from ..inverse_design import Design, Verdict, makers
 from ..inverse_design import design as search
 from ..inverse_design.output import SUFFIXES, save
-from ..inverse_design.plate import for_detail
+from ..inverse_design.plate import for_detail, resolved_strokes
 from ..inverse_design.search import WHITE
+from ..inverse_design.target import finest_strokes
 from ..progress import bytes_text, progress_bar, say, show, table, tell
 from .arguments import Overwrite, check_suffix, converted, parse_numbers
 from .render import Stopped
 
 _MIN_SAID_TIME = 90.0  # s, that a search takes
 _MIN_SAID_MEMORY = 1e9  # bytes
+_MIN_TEXELS, _MAX_TEXELS = 32, 96  # along the period by default; more take minutes
+_LEGIBLE = 2 / 3  # of the texels of --detail, with which letters can be read
 
 
 def design(
@@ -31,11 +35,12 @@ def design(
         Path | None, typer.Option("-o", "--output", help="relief (.gsf, .tif); default: ./TARGET_relief.gsf")
     ] = None,
     texel: Annotated[float, typer.Option(help="side of a texel, µm")] = 0.8,
-    texels: Annotated[int | None, typer.Option(help="texels along the period of the relief; default: 32")] = None,
+    texels: Annotated[int | None, typer.Option(help="texels along the period; default: 32 to 96, by --detail")] = None,
     detail: Annotated[
         float | None,
         typer.Option(
-            help="number of its finest strokes along an edge of the picture; sets --texels, and --angle if need be"
+            help="number of its finest strokes along an edge of the picture, by default as measured in it; sets "
+            "--texels, and --angle if need be"
         ),
     ] = None,
     height_range: Annotated[float, typer.Option(help="largest difference of heights, µm")] = 0.8,
@@ -62,7 +67,10 @@ def design(
     export: Annotated[
         list[str] | None, typer.Option(help="also write: stl, gds (of --levels) or master (of a mould); repeatable")
     ] = None,
-    starts: Annotated[int, typer.Option(help="random reliefs, of which the best is continued; more take longer")] = 24,
+    starts: Annotated[
+        int | None,
+        typer.Option(help="random reliefs, of which the best is continued; default: 24, fewer of many texels"),
+    ] = None,
     seed: Annotated[int, typer.Option(help="of the random reliefs")] = 0,
     overwrite: Overwrite = False,
 ) -> None:
@@ -83,16 +91,21 @@ def design(
     if not invert and _is_dark_on_light(picture):
         say("note", f"{target} is light up to its edges; --invert casts what is dark in it, with more contrast")
     wavelengths = None if wavelength is None else parse_numbers("--wavelength", wavelength).tolist()
+    strokes, longest = finest_strokes(picture), max(wavelengths or WHITE)
     if detail is not None:
         if texels is not None:
             raise RequestError(f"--detail: got {detail:g} and --texels {texels}, wanted one of them")
-        texels, angle = for_detail(detail, texel, angle, max(wavelengths or WHITE))
+        texels, angle = for_detail(detail, texel, angle, longest)
         say("note", f"{texels} texels along the period, angle {angle:g}°, for strokes of 1/{detail:g} of the picture")
+    elif texels is None:
+        fitting = math.ceil(_LEGIBLE * strokes / resolved_strokes(1, texel, angle, longest))
+        texels = min(max(fitting, _MIN_TEXELS), _MAX_TEXELS)
+        say("note", f"{texels} texels along the period; the finest strokes are 1/{strokes:.0f} of the picture")
     with progress_bar(f"design of {target.name}", "iterations") as progress:
         found = search(
             picture,
             texel,
-            texels or 32,
+            texels,
             height_range,
             angle,
             wavelengths,
@@ -101,7 +114,7 @@ def design(
             seen_on=seen_on,
             unused=unused,
             tool_blur=tool_blur,
-            starts=starts,
+            starts=starts or max(4, round(24 * (_MIN_TEXELS / max(texels, _MIN_TEXELS)) ** 2)),
             seed=seed,
             progress=progress,
             expect=_say_effort,
@@ -118,7 +131,7 @@ def design(
     )
     for name, file in exports.items():
         tell(f"{file}: {makers.EXPORTS[name][1]}")
-    verdict = Verdict.of(found)
+    verdict = Verdict.of(found, strokes)
     for warning in filter(None, [found.warning, "" if verdict.grade == "good" else str(verdict)]):
         tell(f"! {warning}")
     if verdict.grade == "good":
@@ -142,11 +155,12 @@ def _is_dark_on_light(picture: NDArray[np.float64]) -> bool:
 
 
 def _report(found: Design) -> None:
-    columns = ["wavelength", "in the target", "correlation", "unevenness", "mirror direction", *found.changed]
-    measures = (found.wavelengths, found.efficiency, found.correlation, found.unevenness, found.mirror)
+    columns = ["wavelength", "in the picture", "correlation", "unevenness", "mirror direction", *found.changed]
+    light, *changed = (found.in_picture(efficiency) for efficiency in (found.efficiency, *found.changed.values()))
+    measures = (found.wavelengths, light, found.correlation, found.unevenness, found.mirror)
     rows = [
         [f"{wavelength:.0f} nm", f"{light:.1%}", f"{correlation:.3f}", f"{unevenness:.2f}", *(f"{x:.1%}" for x in rest)]
-        for wavelength, light, correlation, unevenness, *rest in zip(*measures, *found.changed.values(), strict=True)
+        for wavelength, light, correlation, unevenness, *rest in zip(*measures, *changed, strict=True)
     ]
     show(table(columns, rows), width=130)
     if not np.isnan(found.colour_difference):

@@ -123,6 +123,6 @@ def _plot_efficiency(axes: Axes, design: Design) -> None:
     own, plotted = design.wavelengths, _PLOTTED_WAVELENGTHS
     if not (own.min() >= VISIBLE[0] and own.max() <= VISIBLE[1]):
         plotted = own.mean() * np.linspace(0.8, 1.2, 31)
-    axes.plot(plotted, 100 * design.efficiencies(plotted), color="black")
-    axes.plot(own, 100 * design.efficiency, "o", color="black", ms=4)
-    axes.set(title="light in the target", xlabel="wavelength, nm", ylabel="% of the light", ylim=(0, 100))
+    axes.plot(plotted, 100 * design.in_picture(design.efficiencies(plotted), plotted), color="black")
+    axes.plot(own, 100 * design.in_picture(design.efficiency), "o", color="black", ms=4)
+    axes.set(title="light in the picture", xlabel="wavelength, nm", ylabel="% of what it can use", ylim=(0, 100))

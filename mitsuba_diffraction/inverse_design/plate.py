@@ -48,6 +48,11 @@ def for_detail(detail: float, texel: float, angle: float, wavelength: float) -> 
     return max(4, math.ceil(orders / math.sin(math.radians(angle)))), angle
 
 
+def resolved_strokes(texels: int, texel: float, angle: float, wavelength: float) -> float:
+    """Return how many of the finest strokes that a plate resolves fit along an edge; arguments as of `for_detail`."""
+    return 2 * texels * texel * math.sin(math.radians(angle)) / (_ORDERS_PER_STROKE * wavelength * 1e-3)
+
+
 @dataclass(frozen=True, eq=False)
 class Plate:
     """A periodic relief of square texels, and its light; the arguments of `design`.

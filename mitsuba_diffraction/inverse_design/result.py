@@ -77,10 +77,27 @@ class Design:
         return _efficiency(self.predicted, self.wanted)
 
     @property
+    def usable(self) -> Array:
+        """The fraction of the light that the target can use, (w,): one where no colour leaves any out."""
+        return self.wanted.sum(axis=(1, 2))
+
+    def in_picture(self, efficiency: Array, wavelengths: Array | None = None) -> Array:
+        """Return the fraction in the picture of the light that it can use, (w,), from the fraction of all light.
+
+        At other `wavelengths` than those of the design, nm, its targets are those of the nearest ones.
+        """
+        usable = self.usable if wavelengths is None else self.usable[self._nearest(wavelengths)]
+        return np.minimum(efficiency, usable) / usable
+
+    @property
     def light(self) -> float:
-        """The fraction in the target of the light that it can use, over all wavelengths."""
-        usable = self.wanted.sum(axis=(1, 2))
-        return float(np.minimum(self.efficiency, usable).sum() / usable.sum())
+        """The fraction in the picture of the light that it can use, over all wavelengths."""
+        return float(np.minimum(self.efficiency, self.usable).sum() / self.usable.sum())
+
+    @property
+    def coloured(self) -> bool:
+        """Whether wavelengths have different targets."""
+        return bool(np.ptp(self.wanted, axis=0).max() > 1e-6 * self.wanted.max())
 
     @property
     def contrast(self) -> float:
@@ -142,9 +159,11 @@ class Design:
 
         At each wavelength the target of the nearest wavelength of the design is used.
         """
-        nearest = np.abs(np.subtract.outer(wavelengths, self.wavelengths)).argmin(axis=1)
         predicted = _far_field(self.height_field, self.plate, wavelengths, self.wanted.shape[1])[0]
-        return _efficiency(predicted, self.wanted[nearest])
+        return _efficiency(predicted, self.wanted[self._nearest(wavelengths)])
+
+    def _nearest(self, wavelengths: Array) -> NDArray[np.intp]:
+        return np.abs(np.subtract.outer(wavelengths, self.wavelengths)).argmin(axis=1)
 
 
 def _pixels_per_texel(plate: Plate) -> int:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 
 import numpy as np
+import scipy.ndimage
 from numpy.typing import ArrayLike
 
 from ..errors import RequestError
@@ -13,6 +14,8 @@ from .far_field import Array, lobes_in_bins
 from .plate import Plate
 
 _BINS_PER_ORDER = 1.5
+_MAX_PIXELS = 512  # along an edge, in which strokes are measured
+_KEPT = 0.9  # of the bright part, by discs as wide as its finest strokes
 
 
 def wanted_fractions(target: ArrayLike, plate: Plate) -> Array:
@@ -68,6 +71,27 @@ def with_unused(wanted: Array, plate: Plate) -> Array:
         lobe = lobes_in_bins(edges, [0], plate.period, wavelength * 1e-3, plate.coherence_length)[:, 0]
         one += (1 - one.sum()) * np.outer(lobe, lobe)
     return aim
+
+
+def finest_strokes(target: ArrayLike) -> float:
+    """Return how many of the finest bright strokes of a picture fit along its longer edge.
+
+    The width of a stroke is the diameter of the largest disc whose opening keeps 90 % of the bright part, which is
+    brighter than half of the maximum (granulometry: Matheron 1975, Random Sets and Integral Geometry).
+    """
+    picture = np.asarray(target, np.float64)
+    grey = picture if picture.ndim == 2 else picture.mean(axis=-1)
+    step = math.ceil(max(grey.shape) / _MAX_PIXELS)
+    bright = np.pad(grey[::step, ::step] > grey.max() / 2, 1)
+    depth = scipy.ndimage.distance_transform_edt(bright)
+    for radius in range(2, math.ceil(depth.max()) + 1):
+        opened = scipy.ndimage.distance_transform_edt(depth < radius) < radius
+        if np.count_nonzero(opened & bright) < _KEPT * np.count_nonzero(bright):
+            break
+    else:
+        radius = math.ceil(depth.max()) + 1
+    # The last radius that keeps it is of strokes of 2 radius − 1 or 2 radius pixels.
+    return max(grey.shape) / step / (2 * radius - 2.5)
 
 
 def _in_bins(channels: Array, count: int) -> Array:

@@ -7,15 +7,18 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from .plate import Plate
+from .plate import Plate, resolved_strokes
 from .result import Design
 
 # Fraction of the light in the picture, contrast, correlation with the target: at least these, means over wavelengths.
 GOOD_BOUNDS = (0.6, 0.6, 0.85)
 VISIBLE_BOUNDS = (0.3, 0.3, 0.6)
+# ΔE00 of a coloured target and what is predicted, at most these.
+COLOUR_BOUNDS = {"good": 10.0, "fair": 15.0}
 _MAX_STEP = 0.45  # of levels, in wavelengths of path difference; larger ones send light into the mirror direction
 _MIN_PATH = 0.75  # of the whole relief, in wavelengths
 _MAX_LIT = 0.6  # fraction of the frame that is light
+_NO_PIGMENTS = "one relief has no three pigments: all wavelengths follow the same slopes"
 
 
 @dataclass(frozen=True)
@@ -23,9 +26,10 @@ class Verdict:
     """What a plate is worth: "good", "visible" or "bad", with its measures and, unless it is good, a remedy.
 
     Attributes:
-        grade: by `GOOD_BOUNDS` and `VISIBLE_BOUNDS`.
+        grade: by `GOOD_BOUNDS` and `VISIBLE_BOUNDS`; at most "visible" where colours are poor.
         light, contrast, correlation: means over the wavelengths.
         remedy: which option to change, or "".
+        colours: "good", "fair" or "poor" by `COLOUR_BOUNDS`, with ΔE00; "" of a grey target and of a laser.
     """
 
     grade: str
@@ -33,10 +37,11 @@ class Verdict:
     contrast: float
     correlation: float
     remedy: str
+    colours: str = ""
 
     @classmethod
-    def of(cls, design: Design) -> Verdict:
-        """Judge a design."""
+    def of(cls, design: Design, strokes: float | None = None) -> Verdict:
+        """Judge a design; `strokes` is the number of finest strokes of its picture along an edge, for the remedy."""
         measures = design.light, design.contrast, float(np.mean(design.correlation))
         grade = next(
             (
@@ -46,20 +51,28 @@ class Verdict:
             ),
             "bad",
         )
-        return cls(grade, *measures, "" if grade == "good" else _remedy(design))
+        difference, colours, remedy = design.colour_difference, "", ""
+        if design.coloured and not math.isnan(difference):
+            name = next((name for name, bound in COLOUR_BOUNDS.items() if difference <= bound), "poor")
+            colours = f"{name} (ΔE00 {difference:.0f})"
+            if name == "poor" and grade == "good":
+                grade, remedy = "visible", _NO_PIGMENTS
+        return cls(grade, *measures, "" if grade == "good" else remedy or _remedy(design, strokes), colours)
 
     def __str__(self) -> str:
         numbers = (
             f"{self.light:.0%} of the light in the picture, contrast {self.contrast:.2f}, correlation "
             f"{self.correlation:.2f}"
-        )
+        ) + (f", colours {self.colours}" if self.colours else "")
         if self.grade == "good":
             return f"good: {numbers}"
         said = "the picture can be seen, but is pale or uneven" if self.grade == "visible" else "the picture fails"
+        if self.remedy == _NO_PIGMENTS:
+            said = "the picture can be seen, in other colours"
         return f"{said}: {numbers}; {self.remedy}"
 
 
-def _remedy(design: Design) -> str:
+def _remedy(design: Design, strokes: float | None) -> str:
     """Return the option that most likely helps, the first cause that is found."""
     plate = design.plate
     wave = _depth(plate)  # µm, of a path difference of one wavelength
@@ -81,7 +94,13 @@ def _remedy(design: Design) -> str:
         return f"the tool is too blunt: --tool-blur of at most a texel, {plate.texel:.2g} µm"
     if design.inside.mean() > _MAX_LIT:
         return "most of the picture is light: --invert casts its dark parts instead"
-    return "use a picture of less detail, or more --texels"
+    resolved = resolved_strokes(plate.texels, plate.texel, plate.angle, float(plate.wavelengths.max()))
+    if strokes is not None and strokes > resolved:
+        return (
+            f"its finest strokes are 1/{strokes:.0f} of it, and the plate resolves 1/{resolved:.0f}: "
+            f"--detail {strokes:.0f}"
+        )
+    return "use a picture of less detail"
 
 
 def _depth(plate: Plate) -> float:

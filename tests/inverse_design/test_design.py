@@ -1,6 +1,7 @@
 """Designs: what the BSDF and the precomputed spectrum say of them, and requests that are refused."""
 
 import tracemalloc
+import types
 from pathlib import Path
 
 import colour
@@ -14,7 +15,7 @@ from mitsuba_diffraction.inverse_design.output import save
 from mitsuba_diffraction.inverse_design.plate import Plate
 from mitsuba_diffraction.inverse_design.search import WHITE
 from mitsuba_diffraction.inverse_design.target import wanted_fractions
-from mitsuba_diffraction.inverse_design.verdict import GOOD_BOUNDS, VISIBLE_BOUNDS
+from mitsuba_diffraction.inverse_design.verdict import COLOUR_BOUNDS, GOOD_BOUNDS, VISIBLE_BOUNDS
 from mitsuba_diffraction.precomputation.recipe import Recipe
 
 SMALL = {"texel": 1.0, "texels": 16, "starts": 6, "seen_on": "screen"}
@@ -328,8 +329,40 @@ def test_a_plate_that_works_is_good(laser):
     assert str(verdict).startswith(f"good: {laser.efficiency[0]:.0%} of the light in the picture, contrast 0.")
 
 
+@pytest.mark.parametrize(
+    ("difference", "coloured", "grade", "words"),
+    [
+        (8.0, True, "good", "colours good (ΔE00 8)"),
+        (12.0, True, "good", "colours fair (ΔE00 12)"),
+        (24.0, True, "visible", "in other colours: 84% of the light in the picture, contrast 0.90, correlation 0.95, "),
+        (24.0, False, "good", "correlation 0.95"),
+    ],
+)
+def test_colours_are_in_the_verdict(difference, coloured, grade, words):
+    """A sunset of ΔE00 24 came out teal, and was called good."""
+    found = types.SimpleNamespace(
+        light=0.84, contrast=0.9, correlation=[0.95], colour_difference=difference, coloured=coloured
+    )
+    verdict = Verdict.of(found)
+    assert verdict.grade == grade
+    assert words in str(verdict)
+    assert ("one relief has no three pigments" in str(verdict)) == (grade == "visible")
+
+
+def test_the_light_in_the_picture_is_of_what_its_colours_can_use():
+    red = np.zeros((16, 16, 3))
+    red[4:12, 9:15, 0] = 1
+    found = md.design(red, wavelengths=[450, 550, 650], texel=1.0, texels=12, starts=1)
+    fractions = found.in_picture(found.efficiency)
+    assert found.coloured
+    np.testing.assert_allclose(fractions * found.wanted.sum(axis=(1, 2)), np.minimum(found.efficiency, found.usable))
+    assert (fractions[:2] > 2 * found.efficiency[:2]).all()  # of blue and green it can use little
+    np.testing.assert_allclose(found.in_picture(found.efficiency, found.wavelengths + 1), fractions)
+
+
 def test_the_page_states_the_thresholds():
     page = (Path(__file__).parents[2] / "docs" / "design.md").read_text()
+    assert "ΔE00 of at most {good:.0f} is good, of at most {fair:.0f} fair".format(**COLOUR_BOUNDS) in page
     for name, (light, contrast, correlation) in (("good", GOOD_BOUNDS), ("the picture can be seen, ", VISIBLE_BOUNDS)):
         (row,) = [line for line in page.splitlines() if line.startswith(f"| {name}")]
         assert row.endswith(f"| ≥ {light:.0%} | ≥ {contrast:g} | ≥ {correlation:g} |".replace("%", " %"))

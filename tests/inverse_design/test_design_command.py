@@ -10,6 +10,7 @@ import mitsuba_diffraction as md
 from mitsuba_diffraction import cli
 from mitsuba_diffraction.files.outputs import check_outputs
 from mitsuba_diffraction.files.picture_file import read_picture
+from mitsuba_diffraction.inverse_design.target import finest_strokes
 from mitsuba_diffraction.precomputation.recipe import Recipe
 
 OPTIONS = "--texel 1 --texels 12 --wavelength 532 --starts 1"
@@ -64,6 +65,17 @@ def test_texels_follow_from_the_detail(command):
     code, _, error = command("design flag.png --texel 1 --wavelength 532 --starts 1 --detail 4")
     assert code == 0
     assert "note: 11 texels along the period, angle 17.5°, for strokes of 1/4 of the picture" in error
+
+
+def test_texels_follow_from_the_finest_strokes_of_the_picture(command):
+    bars = np.zeros((240, 240), np.uint8)
+    bars[40:200, 30:210:24] = bars[40:200, 31:210:24] = bars[40:200, 32:210:24] = 255  # three pixels wide
+    Image.fromarray(bars).save("bars.png")
+    assert finest_strokes(read_picture(Path("bars.png"))) == pytest.approx(80, rel=0.2)
+    assert finest_strokes(np.pad(np.ones((3, 20)), 10)) == pytest.approx(40 / 3, rel=0.2)
+    code, _, error = command("design flag.png --wavelength 532 --height-range 0.3 --starts 1")
+    assert code == 0
+    assert "note: 32 texels along the period; the finest strokes are 1/7 of the picture" in error
 
 
 def test_a_target_is_a_picture_as_seen_on_a_screen():
