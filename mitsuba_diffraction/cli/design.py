@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 import math
 from pathlib import Path
 from typing import Annotated
@@ -91,16 +92,16 @@ def design(
     if not invert and _is_dark_on_light(picture):
         say("note", f"{target} is light up to its edges; --invert casts what is dark in it, with more contrast")
     wavelengths = None if wavelength is None else parse_numbers("--wavelength", wavelength).tolist()
-    strokes, longest = finest_strokes(picture), max(wavelengths or WHITE)
+    strokes, longest, note = finest_strokes(picture), max(wavelengths or WHITE), ""
     if detail is not None:
         if texels is not None:
             raise RequestError(f"--detail: got {detail:g} and --texels {texels}, wanted one of them")
         texels, angle = for_detail(detail, texel, angle, longest)
-        say("note", f"{texels} texels along the period, angle {angle:g}°, for strokes of 1/{detail:g} of the picture")
+        note = f"{texels} texels along the period, angle {angle:g}°, for strokes of 1/{detail:g} of the picture"
     elif texels is None:
         fitting = math.ceil(_LEGIBLE * strokes / resolved_strokes(1, texel, angle, longest))
         texels = min(max(fitting, _MIN_TEXELS), _MAX_TEXELS)
-        say("note", f"{texels} texels along the period; the finest strokes are 1/{strokes:.0f} of the picture")
+        note = f"{texels} texels along the period; the finest strokes are 1/{strokes:.0f} of the picture"
     with progress_bar(f"design of {target.name}", "iterations") as progress:
         found = search(
             picture,
@@ -117,7 +118,7 @@ def design(
             starts=starts or max(4, round(24 * (_MIN_TEXELS / max(texels, _MIN_TEXELS)) ** 2)),
             seed=seed,
             progress=progress,
-            expect=_say_effort,
+            expect=functools.partial(_say_effort, note),
         )
     paths = save(found, path)
     makers.export(found, exports)
@@ -140,7 +141,9 @@ def design(
         raise Stopped(f"{relief} holds the best relief so far")
 
 
-def _say_effort(seconds: float, memory: float) -> None:
+def _say_effort(chosen: str, seconds: float, memory: float) -> None:
+    if chosen:
+        say("note", chosen)
     if seconds > _MIN_SAID_TIME or memory > _MIN_SAID_MEMORY:
         minutes = f"{seconds / 60:.0f} min" if seconds > _MIN_SAID_TIME else f"{seconds:.0f} s"
         effort = f"about {minutes} and {bytes_text(memory)} of memory"

@@ -1,6 +1,5 @@
 """Filling of missing pixels: harmonic between the known ones, which it leaves alone."""
 
-
 import numpy as np
 import pytest
 from covering import covering
