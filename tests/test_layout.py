@@ -34,6 +34,7 @@ LEVELS = (
     ("scalar_theory",),
     ("precomputation",),
     ("inspection",),
+    ("export",),
     ("inverse_design",),
     ("bsdf",),
     ("integrator",),

@@ -26,6 +26,7 @@ from ..progress import NAME, say, tell
 from .design import design
 from .efficiency import efficiency
 from .examples import examples
+from .export import export
 from .hologram import hologram
 from .inspect import inspect
 from .precompute import precompute
@@ -53,7 +54,7 @@ _EVALUATION_COMMANDS = ("compare", "convergence", "validate", "benchmark")
 _evaluation = (
     getattr(importlib.import_module(f"..evaluation.commands.{n}", __name__), n) for n in _EVALUATION_COMMANDS
 )
-for _command in (inspect, design, precompute, render, view, efficiency, hologram, examples, *_evaluation):
+for _command in (inspect, design, precompute, render, view, efficiency, export, hologram, examples, *_evaluation):
     app.command(cls=_Command)(_command)
 
 

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from ..errors import RequestError
 from ..files.writing import refuse_other_than_utf8
-from ..precomputation.recipe import Recipe, source_named
+from ..precomputation.recipe import Recipe, parameters_of_profile, source_named
 from ..progress import say
 from ..settings import SPECTRUM_PARAMETERS, SUN_COHERENCE_LENGTH, Settings
 from ..surface.gratings import PROFILES, RENAMED
@@ -215,3 +215,24 @@ def recipe_of(source: Path, of_scan: dict[str, Any], settings: dict[str, Any], e
         names = ", ".join(f"--{name.replace('_', '-')}" for name in of_scan)
         raise RequestError(f"{names} go with a scan; the recipe {source} has its own")
     return Recipe.load(source, **settings)
+
+
+def recipe_with(name: str, values: dict[str, Value], of_scan: dict[str, Any], of_spectrum: dict[str, Any]) -> Recipe:
+    """Return the recipe of a scan, of a profile, or in a file, with values of the profile or the scan.
+
+    Raises:
+        RequestError: if there is no such value.
+    """
+    if Path(name).suffix.lower() == ".toml":
+        recipe = recipe_of(Path(name), of_scan, of_spectrum)
+        return Recipe({**recipe.surface, **values}, recipe.settings, recipe.folder)
+    if is_scan(name):
+        recipe = recipe_of(Path(name), of_scan, of_spectrum)
+        unknown, wanted = list(values), "the options of a scan, such as --pixel-size"
+    else:
+        recipe = Recipe.of_profile(name, values, **of_spectrum)
+        known = parameters_of_profile(name)
+        unknown, wanted = [*of_scan, *(key for key in values if key not in known)], f"some of {', '.join(known)}"
+    if unknown:
+        raise RequestError(f"{name}: got {', '.join(unknown)}, wanted {wanted}")
+    return recipe

@@ -13,21 +13,18 @@ from ..files.outputs import check_outputs
 from ..inspection.efficiency import OrderEfficiencies, efficiencies
 from ..inspection.peaks import check_request, peak_efficiencies
 from ..precomputation.grating_spectrum import GratingSpectrum
-from ..precomputation.recipe import Recipe, parameters_of_profile
 from ..precomputation.spectra import load_spectrum
 from ..progress import progress_bar, tell
 from ..scalar_theory.validity import scalar_error
 from ..settings import ScalarSettings
 from .arguments import (
     Overwrite,
-    Value,
     angles_of,
     check_suffix,
     converted,
-    is_scan,
     options_of_scan,
     parse_numbers,
-    recipe_of,
+    recipe_with,
     settings_of,
     surface_of,
     takes_scan,
@@ -75,7 +72,7 @@ def efficiency(
     of_spectrum: dict[str, Any] = {key: given[key] for key in ("extent", "coherence_length") if key in given}
     recipe = None
     if Path(name).suffix.lower() != ".exr":
-        recipe = _recipe(name, values, of_scan, of_spectrum)
+        recipe = recipe_with(name, values, of_scan, of_spectrum)
     elif options := ", ".join([*values, *of_scan, *of_spectrum]):
         raise RequestError(f"{name}: got {options} with a saved spectrum, wanted the recipe or the scan itself")
     settings = ScalarSettings() if recipe is None else recipe.settings
@@ -126,20 +123,3 @@ def efficiency(
     if plot is not None:
         found.plot(plot)
         tell(f"{plot}: a plot of the strongest {'peaks' if irregular else 'orders'}")
-
-
-def _recipe(name: str, values: dict[str, Value], of_scan: dict[str, Any], of_spectrum: dict[str, Any]) -> Recipe:
-    """Return the recipe of a scan, of a profile, or in a file."""
-    if Path(name).suffix.lower() == ".toml":
-        recipe = recipe_of(Path(name), of_scan, of_spectrum)
-        return Recipe({**recipe.surface, **values}, recipe.settings, recipe.folder)
-    if is_scan(name):
-        recipe = recipe_of(Path(name), of_scan, of_spectrum)
-        unknown, wanted = list(values), "the options of a scan, such as --pixel-size"
-    else:
-        recipe = Recipe.of_profile(name, values, **of_spectrum)
-        known = parameters_of_profile(name)
-        unknown, wanted = [*of_scan, *(key for key in values if key not in known)], f"some of {', '.join(known)}"
-    if unknown:
-        raise RequestError(f"{name}: got {', '.join(unknown)}, wanted {wanted}")
-    return recipe

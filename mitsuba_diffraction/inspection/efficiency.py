@@ -4,31 +4,21 @@ from __future__ import annotations
 
 import csv
 import os
-from collections.abc import Callable
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from .. import rigorous
 from ..errors import RequestError, is_number
 from ..files.outputs import MARK, METADATA
 from ..files.writing import whole_file
-from ..optics.geometry import Orders
-from ..optics.materials import RefractiveIndex, index_of, refractive_index
+from ..optics.materials import RefractiveIndex, index_of
 from ..progress import Progress, silent
-from ..rigorous.coordinate_transformation import curve_of, is_profile
-from ..rigorous.solver import sheet_orders
-from ..scalar_theory.closed_form import (
-    incident_direction,
-    profile_powers,
-    scalar_orders,
-    tile_powers,
-    transmitted_orders,
-)
+from ..rigorous.coordinate_transformation import is_profile
 from ..settings import THEORIES, TRANSMISSIONS
 from ..surface.heightfield import HeightField
+from .order_solver import IncidentLight, index_at, order_solver
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -36,7 +26,6 @@ if TYPE_CHECKING:
 Array = NDArray[np.float64]
 
 POLARISATIONS = ("s", "p")
-_MAX_ORDERS = 1000  # in scalar theory, which evaluates all pairs of orders for E
 _MAX_ROWS, _MAX_COLUMNS = 24, 8  # of a printed table
 _MAX_LINES, _MAX_MAPS = 7, 6  # of a plot
 
@@ -249,12 +238,13 @@ def efficiencies(
         height_field = HeightField(height_field.heights[:1], height_field.pixel_size, height_field.source)
     # The largest |q| is (n_i + n_o)/λ.
     shortest = wavelengths.min() * 1e-3 * (1.0 if transmission == "none" else 2 / (1 + max(_largest(medium), 1)))
-    solve = (_scalar if theory == "scalar" else _rigorous)(height_field, azimuth, shortest, transmission)
+    solver = order_solver(theory, height_field, shortest)
+    solve = {"none": solver.reflected, "interface": solver.transmitted, "sheet": solver.through_sheet}[transmission]
     found: dict[tuple[int, ...], Array] = {}
     for step, (a, w) in enumerate(np.ndindex(len(angles), len(wavelengths)), 1):
         wavelength = float(wavelengths[w]) * 1e-3
         index = index_at(wavelength, material, int_ior, theory)
-        orders = solve(float(angles[a]), wavelength, index)
+        orders = solve(IncidentLight(float(angles[a]), azimuth, wavelength, index))
         for m, *pair in zip(orders.m, orders.s, orders.p, strict=True):
             of_order = found.setdefault(tuple(np.atleast_1d(m).tolist()), np.zeros((len(angles), len(wavelengths), 2)))
             of_order[a, w] = pair
@@ -288,49 +278,6 @@ def description(
         transmission
     ]
     return f"{source}; {what}, {theory} theory{transmitted}{plane}"
-
-
-def index_at(wavelength: float, material: str | None, int_ior: complex | str | None, theory: str = "scalar") -> complex:
-    """Return n + ik at a wavelength in µm; in scalar theory infinite for material "none", the perfect mirror."""
-    if (theory, material, int_ior) == ("scalar", "none", None):
-        return complex("inf")
-    return refractive_index(wavelength, int_ior=int_ior, material=material, known=True)
-
-
-_Solve = Callable[[float, float, complex], Orders]
-"""(angle in degrees, wavelength in µm, index) → efficiencies."""
-
-
-def _scalar(height_field: HeightField, azimuth: float, shortest: float, transmission: str) -> _Solve:
-    x, y = height_field.tile_size
-    profile = height_field.shape[0] == 1
-    if (count := 2 * x / shortest if profile else np.pi * x * y / shortest**2) > _MAX_ORDERS:
-        raise RequestError(
-            f"height field: got about {count:.0f} orders of a tile of {x:.4g} × {y:.4g} µm at {1e3 * shortest:g} nm, "
-            f"wanted at most {_MAX_ORDERS}: one period of a grating"
-        )
-    powers = profile_powers(height_field) if profile else tile_powers(height_field, shortest)
-    period = x if profile else (x, y)
-
-    def solve(angle: float, wavelength: float, index: complex) -> Orders:
-        if transmission == "none":
-            return scalar_orders(powers, period, wavelength, angle, index, azimuth)
-        is_sheet = transmission == "sheet"
-        return transmitted_orders(powers, period, wavelength, angle, index.real, azimuth, sheet=is_sheet)
-
-    return solve
-
-
-def _rigorous(height_field: HeightField, azimuth: float, shortest: float, transmission: str) -> _Solve:
-    def solve(angle: float, wavelength: float, index: complex) -> Orders:
-        direction = incident_direction(angle, azimuth)
-        found = rigorous.efficiencies(height_field, direction, wavelength, int_ior=index)
-        if transmission != "sheet":
-            return found.reflection if transmission == "none" else found.transmission
-        k_0 = height_field.tile_size[0] / wavelength
-        return sheet_orders(curve_of(height_field), direction, k_0, index.real, found.harmonics)
-
-    return solve
 
 
 def checked_numbers(name: str, values: ArrayLike, wanted: str, low: float, high: float) -> Array:

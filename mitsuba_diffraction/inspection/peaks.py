@@ -23,7 +23,8 @@ from ..scalar_theory.closed_form import incident_direction, mirrored
 from ..spectrum.grids import OrderGrid
 from ..spectrum.power_spectrum import PowerSpectrum
 from ..surface.periods import Period
-from .efficiency import OrderEfficiencies, checked_numbers, description, index_at
+from .efficiency import OrderEfficiencies, checked_numbers, description
+from .order_solver import index_at
 
 Array = NDArray[np.float64]
 

@@ -142,9 +142,23 @@ def transmitted_orders(
     is the angle of the direction into which a plane would refract the light. The efficiencies sum to at most one. For a
     sheet, with light from above, they include the transmittance 1 − F of the flat face.
     """
+    tangent = incident_direction(angle, azimuth)[:2]
+    return transmitted_at(powers, period, wavelength, tangent, index, from_below, sheet)
+
+
+def transmitted_at(
+    powers: OrderPowers,
+    period: float | tuple[float, float],
+    wavelength: float,
+    tangent: Array,
+    index: float,
+    from_below: bool = False,
+    sheet: bool = False,
+) -> Orders:
+    """Compute `transmitted_orders` of light of any tangential wave vector n_i ω_i,∥, (2,); below, up to the index."""
     n_i, n_o, side = (index, 1.0, -1) if from_below else (1.0, index, 1)
     m, steps = _lattice(wavelength / np.atleast_1d(period), n_i + n_o)
-    found = diffracted(incident_direction(angle, azimuth)[:2], steps, n_i, n_o)
+    found = diffracted(tangent, steps, n_i, n_o)
     # S(q; −κ) = S(−q; κ)
     kappa, sign = 2 * np.pi * np.abs(found.v_z) / wavelength, np.where(side * found.v_z < 0, -1, 1)
     m = m[found.kept]

@@ -1,0 +1,167 @@
+"""A grating and its material as they are exported, and all of its orders for light of one direction."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass, replace
+from functools import cached_property
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from ..errors import RequestError
+from ..inspection.efficiency import checked_numbers, description
+from ..inspection.order_solver import IncidentLight, OrderSolver, index_at, order_solver
+from ..optics.geometry import Orders
+from ..optics.materials import index_of
+from ..precomputation.recipe import Recipe
+from ..rigorous.coordinate_transformation import is_profile
+from ..settings import THEORIES
+from ..surface.heightfield import HeightField
+
+Array = NDArray[np.float64]
+Complex = NDArray[np.complex128]
+
+_ALONG_NORMAL = 1e-9  # degrees: light along the normal keeps a plane of incidence, and with it s and p
+
+
+@dataclass(frozen=True, eq=False)
+class DiffractedSide:
+    """The orders on one side of the grating.
+
+    Attributes:
+        side: "reflected" or "transmitted".
+        orders: their efficiencies.
+        directions: ω_o, (n, 3).
+        amplitudes: (n, 2, 2), [order, polarisation of the order, of the light], s before p, of which |·|² is a fraction
+            of the incident power; None in scalar theory.
+    """
+
+    side: str
+    orders: Orders
+    directions: Array
+    amplitudes: Complex | None
+
+    @property
+    def m(self) -> NDArray[np.int64]:
+        """The orders as (m_x, m_y), (n, 2)."""
+        m = self.orders.m
+        return m if m.ndim == 2 else np.stack([m, np.zeros_like(m)], axis=1)
+
+
+@dataclass(frozen=True, eq=False)
+class ExportedGrating:
+    """A periodic surface, its material and the theory of its efficiencies.
+
+    Attributes:
+        height_field: one period.
+        theory: "scalar" or "rigorous".
+        material: a conductor by Mitsuba's name or a file; "none" is the perfect mirror, in scalar theory.
+        int_ior: or the index of a dielectric, a number, a name or a file.
+        shortest: µm, the shortest wavelength that is asked for.
+
+    Raises:
+        ValueError: if the material or the theory is wrong, or more than 1000 orders propagate.
+    """
+
+    height_field: HeightField
+    theory: str
+    material: str | None
+    int_ior: complex | str | None
+    shortest: float
+
+    def __post_init__(self) -> None:
+        if self.theory not in THEORIES:
+            raise RequestError(f"theory: got {self.theory!r}, wanted one of {', '.join(THEORIES)}")
+        if self.material is not None and self.int_ior is not None:
+            raise RequestError(f"material: got {self.material!r} and int_ior {self.int_ior}, wanted one of the two")
+        self.index(self.shortest)
+
+    @classmethod
+    def of_recipe(cls, recipe: Recipe, name: str, parameters: Mapping[str, Any], shortest: float) -> ExportedGrating:
+        """Return the grating of a recipe.
+
+        Args:
+            recipe: of the surface.
+            name: of it, for messages.
+            parameters: theory, material and int_ior, in the place of those of the recipe.
+            shortest: as the attribute.
+
+        Raises:
+            ValueError: if the surface is not periodic, or as the class.
+        """
+        if recipe.settings.extent == "sample" or recipe.patches > 1:
+            raise RequestError(
+                f"{name}: got an irregular surface, which has no orders, wanted a grating; `efficiency {name} --csv` "
+                "tabulates its peaks, and a file .osl holds its spectrum"
+            )
+        chosen = recipe.settings.chosen
+        given = {key: parameters[key] for key in ("material", "int_ior") if key in parameters}
+        material_of = given or {key: chosen[key] for key in ("material", "int_ior") if key in chosen}
+        field = recipe.height_field()
+        if is_profile(field):
+            field = HeightField(field.heights[:1], field.pixel_size, field.source)
+        return cls(
+            field,
+            parameters.get("theory", recipe.settings.theory),
+            material_of.get("material"),
+            material_of.get("int_ior", None if "material" in material_of else 1.5),
+            shortest,
+        )
+
+    @property
+    def description(self) -> str:
+        """What it is, in one line."""
+        return description(self.height_field.source, self.material, self.int_ior, 0.0, self.theory)
+
+    @property
+    def period(self) -> tuple[float, float]:
+        """µm, along x and y; of a line grating the same along both."""
+        x, y = self.height_field.tile_size
+        return (x, x) if self.height_field.shape[0] == 1 else (x, y)
+
+    @property
+    def transmits(self) -> bool:
+        """Whether light crosses the surface."""
+        return self.int_ior is not None and not index_of("int_ior", self.int_ior).absorbs
+
+    def index(self, wavelength: float) -> complex:
+        """Return n + ik at a wavelength in µm."""
+        return index_at(wavelength, self.material, self.int_ior, self.theory)
+
+    @cached_property
+    def _solver(self) -> OrderSolver:
+        largest = 1.0 if self.int_ior is None else max(1.0, index_of("int_ior", self.int_ior).values.real.max())
+        # The largest |q| is 2n/λ, of light reflected inside.
+        return order_solver(self.theory, self.height_field, self.shortest / largest)
+
+    def diffracted(self, light: IncidentLight) -> Iterator[DiffractedSide]:
+        """Yield the reflected and, of a dielectric, the transmitted orders of light.
+
+        Light along the normal is taken in the limit of its plane of incidence. In scalar theory, which can exceed it,
+        the power of both sides is reduced to the incident power.
+        """
+        light = replace(light, angle=light.angle or _ALONG_NORMAL)
+        found = {"reflected": self._solver.reflected(light)}
+        if self.transmits:
+            found["transmitted"] = self._solver.transmitted(light)
+        total = max(1.0, sum(orders.unpolarised.sum() for orders in found.values()))
+        pair = self._solver.amplitudes(light) or (None, None)
+        for (side, orders), amplitudes in zip(found.items(), pair, strict=False):
+            if self.theory == "scalar":
+                orders = Orders(orders.m, orders.s / total, orders.p / total)
+            yield DiffractedSide(side, orders, light.directions(orders, self.period, side == "reflected"), amplitudes)
+
+
+def checked_ranges(wavelengths: ArrayLike, angles: ArrayLike, azimuths: ArrayLike) -> tuple[Array, Array, Array]:
+    """Return wavelengths in nm, (w,), angles, (a,), and azimuths, (b,), if they are in range.
+
+    Raises:
+        ValueError: if one is not.
+    """
+    return (
+        checked_numbers("wavelengths", wavelengths, "nm from 10 to 100000 (100 µm)", 9.999, 100_000.001),
+        checked_numbers("angles", angles, "degrees above −90 and below 90", -90.0, 90.0),
+        checked_numbers("azimuths", azimuths, "degrees from −360 to 360", -360.001, 360.001),
+    )
