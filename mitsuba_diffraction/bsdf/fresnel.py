@@ -10,11 +10,11 @@ import numpy as np
 
 from ..errors import RequestError
 from ..optics.film_stack import Stack
-from ..optics.materials import MAX_INDEX, MIN_INDEX, RefractiveIndex, constant, index_of, is_file
+from ..optics.materials import MAX_INDEX, MIN_INDEX, KnownRange, RefractiveIndex, constant, index_of, is_file
 from .base import nested_plugin
 from .coat import Coat
 from .device_tables import opaque
-from .indices import Dispersion, absolute_index, index_from, nodes_of
+from .indices import Dispersion, absolute_index, check_spectra, index_from, known_spectrum, nodes_of
 
 
 class Material:
@@ -22,7 +22,6 @@ class Material:
 
     Attributes:
         transparent: whether transmitted light is not absorbed.
-        wavelengths: range in which the reflectance is known, nm.
         eta: relative index of refraction in the middle of visible light, a mi.Float; None without an index.
         outside: absolute index of the medium above, to which indices are relative.
         varies: whether the material varies over the surface.
@@ -30,7 +29,6 @@ class Material:
     """
 
     transparent: bool = False
-    wavelengths: tuple[float, float] = (0.0, np.inf)
     eta: Any = None
     outside: float = 1.0
     varies: bool = False
@@ -46,6 +44,10 @@ class Material:
         """Return R, and T of a transparent material, at the cosine ω_i·h."""
         reflected = self(si, cos_half, active)
         return reflected, 1 - reflected
+
+    def known(self) -> tuple[KnownRange, ...]:
+        """Return where each index of the material is known."""
+        return ()
 
     def index(self, si: mi.SurfaceInteraction3f, active: mi.Bool) -> list[mi.Complex2f]:
         """Return n + ik of each wavelength."""
@@ -137,8 +139,10 @@ class Dielectric(Material):
         self.eta = mi.Float(medium.nominal.real / outside)
         if not medium.is_constant:
             self.dispersion = Dispersion(medium, outside)
-            self.wavelengths = self.dispersion.wavelengths
         self.update()
+
+    def known(self) -> tuple[KnownRange, ...]:
+        return (self.medium.known("int_ior", clear=True),)
 
     def update(self) -> None:
         """Check the index and make it an opaque array: Dr.Jit would compile a literal into its kernels.
@@ -193,6 +197,13 @@ class SpectralConductor(Material):
         self.textures, self.outside = (eta, k), outside
         self._divisor = None if outside == 1 else opaque(outside)
         self.varies = eta.is_spatially_varying() or k.is_spatially_varying()
+        self.update()
+
+    def update(self) -> None:
+        check_spectra(*self.textures)
+
+    def known(self) -> tuple[KnownRange, ...]:
+        return tuple(known_spectrum(name, spectrum) for name, spectrum in zip(("eta", "k"), self.textures, strict=True))
 
     def __call__(self, si: mi.SurfaceInteraction3f, cos_half: mi.Float, active: mi.Bool) -> mi.UnpolarizedSpectrum:
         return mi.UnpolarizedSpectrum([mi.fresnel_conductor(cos_half, n) for n in self.index(si, active)])
@@ -230,10 +241,15 @@ class Conductor(SpectralConductor):
                 wavelength_max=float(grid[-1]),
                 values=", ".join(repr(float(value)) for value in part),
             )
+            if part.any()
+            else nested_plugin("uniform", value=0.0)  # Mitsuba takes no table of zeros
             for part in (values.real, values.imag)
         )
         super().__init__(of_n, of_k, 1.0)
-        self.medium, self.outside, self.wavelengths = medium, outside, (float(grid[0]), float(grid[-1]))
+        self.medium, self.outside = medium, outside
+
+    def known(self) -> tuple[KnownRange, ...]:
+        return (self.medium.known("material"),)
 
     def __repr__(self) -> str:
         return f"conductor, {self.medium}"

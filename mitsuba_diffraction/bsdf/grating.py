@@ -69,17 +69,13 @@ class Grating:
         A spectrum from a recipe or a profile is computed again if it does not cover this range.
 
         Raises:
-            RequestError: if the material or a saved spectrum does not cover them, or the coherence length is shorter.
+            RequestError: if an index or a saved spectrum does not cover them, or the coherence length is shorter.
         """
         self._check_window(wavelengths[1])
-        (first, last), (shortest, longest) = wavelengths, self.theory.material.wavelengths
-        if first < shortest * (1 - 1e-6) or last > longest * (1 + 1e-6):
-            raise RequestError(
-                f"material: got light of {first:g} to {last:g} nm, and a table of {shortest:g} to {longest:g} nm "
-                f"({self.theory.material}); wanted light inside its range, int_ior, or material=none (R = 1)"
-            )
+        for index in self._request.known:
+            index.check(wavelengths)
         before = self.theory.light or wavelengths
-        wavelengths = min(first, before[0]), max(last, before[1])
+        wavelengths = min(wavelengths[0], before[0]), max(wavelengths[1], before[1])
         if wavelengths == self.theory.light:
             return
         try:
@@ -108,8 +104,9 @@ class Grating:
             )
 
     def _range(self) -> tuple[float, float]:
-        """Return the shortest and the longest wavelength that both spectrum and material cover, nm."""
-        shortest, longest = np.clip(self.theory.wavelengths, *self.theory.material.wavelengths)
+        """Return the shortest and the longest wavelength that the spectrum and all indices cover, nm."""
+        first, last = zip(*(index.wavelengths for index in self._request.known), strict=True)
+        shortest, longest = np.clip(self.theory.wavelengths, max(first), min(last))
         return float(shortest), float(longest)
 
     def parameters_changed(self, keys: list[str]) -> None:

@@ -14,7 +14,7 @@ import numpy as np
 
 from ..errors import RequestError, is_number
 from ..optics.geometry import SHADOWING
-from ..optics.materials import RefractiveIndex, is_file
+from ..optics.materials import KnownRange, RefractiveIndex, is_file
 from ..precomputation.recipe import REQUESTED, Recipe, source_named
 from ..precomputation.spectra import Spectrum, load_spectrum
 from ..rigorous.rigorous_spectrum import RigorousSpectrum
@@ -32,7 +32,7 @@ from .base import nested_plugin
 from .coat import SAME_INDEX, Coat, coat_from
 from .device_tables import larger
 from .fresnel import Conductor, Material, PerfectMirror, SpectralConductor, reflectance_from
-from .indices import absolute_index, index_from
+from .indices import index_from
 from .thin_film import with_film
 from .varying import VaryingNumber, check_texture, numbers_from
 
@@ -63,6 +63,7 @@ class Media:
         eta: index of the transparent material relative to the outside, in the middle of visible light; None without
             transmission.
         densest: the maximum absolute index next to the relief at any visible wavelength.
+        known: where the indices of the outside and of the coat are known.
     """
 
     outside: float
@@ -70,6 +71,7 @@ class Media:
     transmission: str
     eta: float | None
     densest: float
+    known: tuple[KnownRange, ...]
 
     @classmethod
     def of(cls, props: mi.Properties) -> Media:
@@ -79,14 +81,17 @@ class Media:
             RequestError: if an index is out of range, or the material does not transmit.
         """
         coat = coat_from(props)
-        exterior = absolute_index("ext_ior", props.get("ext_ior", "air"))
+        above = index_from("ext_ior", props.get("ext_ior", "air"))
+        exterior = above.nominal.real
+        coats = () if coat is None else (coat.medium.known("coat_ior", clear=True),)
+        known = above.known("ext_ior", clear=True), *coats
         outside = 1.0 if abs(exterior - 1) < SAME_INDEX else exterior
         kind = props.get("transmission", TRANSMISSIONS[0])
         if kind not in TRANSMISSIONS:
             raise RequestError(f"transmission: got {kind!r}, wanted one of {', '.join(TRANSMISSIONS)}")
         if kind == "none":
             densest = outside if coat is None else outside * coat.relative * _densest(coat.medium, coat.index)
-            return cls(outside, coat, kind, None, densest)
+            return cls(outside, coat, kind, None, densest, known)
         for name in ("material", "base", "coat_ior", "eta", "k"):
             if name in props:
                 got = repr(props[name]) if isinstance(props[name], str | float | int) else "a BSDF"
@@ -96,7 +101,8 @@ class Media:
         eta = medium.nominal.real / exterior
         if abs(eta - 1) < SAME_INDEX:
             raise RequestError(f"int_ior: got that of the outside with transmission={kind}, wanted another one")
-        return cls(outside, coat, kind, eta, outside * max(1.0, eta * _densest(medium, medium.nominal.real)))
+        densest = outside * max(1.0, eta * _densest(medium, medium.nominal.real))
+        return cls(outside, coat, kind, eta, densest, known)
 
     @property
     def index(self) -> float:
@@ -430,6 +436,11 @@ class GratingRequest:
     shadowing: bool
     conserve_energy: bool
     surface: Spectrum | Recipe
+
+    @property
+    def known(self) -> tuple[KnownRange, ...]:
+        """Where each index that the scene names is known."""
+        return *self.media.known, *self.material.known()
 
     def widened(self, wavelengths: tuple[float, float]) -> Recipe | None:
         """Return the recipe for light of these wavelengths in air, nm; None for one that sets its own, or a file."""

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import re
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Any
 
 import drjit as dr
@@ -17,11 +18,11 @@ import numpy as np
 
 from ..errors import RequestError
 from ..optics import film_stack
-from ..optics.materials import RefractiveIndex
+from ..optics.materials import KnownRange, RefractiveIndex, is_file
 from .device_tables import PacketTable, integer_part, larger, limited, opaque
 from .fresnel import Material, PerfectMirror
 from .indices import MAX_INDEX_NODES, Dispersion, index_from, nodes_of
-from .varying import VaryingNumber
+from .varying import VaryingNumber, number_or_text
 
 MAX_THICKNESS = 4.0  # µm in all: the fringes of thicker films are narrow in λ
 MAX_FILMS = 100
@@ -134,7 +135,7 @@ def with_film(props: mi.Properties, material: Material) -> Material:
         raise RequestError("thin_film_thickness: got a film on material=none, wanted a dielectric or a conductor")
     iors, thicknesses = props["thin_film_ior"], props["thin_film_thickness"]
     indices = list_entries("thin_film_ior", iors) if isinstance(iors, str) else [iors]
-    media = [index_from("thin_film_ior", _number_or_name(ior), absorbing=True) for ior in indices]
+    media = [index_from("thin_film_ior", number_or_text(ior), absorbing=True) for ior in indices]
     scale = VaryingNumber(props, "thin_film_scale", 1.0)
     if len(media) == 1 and not (isinstance(thicknesses, str) and _is_list(thicknesses)):
         return FilmedMaterial(material, media[0], VaryingNumber(props, "thin_film_thickness", 0.0), scale)
@@ -144,7 +145,7 @@ def with_film(props: mi.Properties, material: Material) -> Material:
             f"thin_film_thickness: got {given_as} for {len(media)} films, wanted a list of as many numbers; "
             "thin_film_scale is a number or texture by which they are multiplied"
         )
-    numbers = [_number_or_name(text) for text in list_entries("thin_film_thickness", thicknesses)]
+    numbers = [number_or_text(text) for text in list_entries("thin_film_thickness", thicknesses)]
     if any(isinstance(number, str) for number in numbers):
         raise RequestError(f"thin_film_thickness: got {thicknesses!r}, wanted numbers of µm")
     if len(numbers) != len(media):
@@ -159,17 +160,10 @@ def _is_list(text: str) -> bool:
     return "," in text or re.search(r"\d\s*[x×]\s*\(", text) is not None
 
 
-def _number_or_name(ior: float | str) -> float | str:
-    if isinstance(ior, str):
-        try:
-            return float(ior)
-        except ValueError:
-            return ior
-    return ior
-
-
 def list_entries(name: str, text: str) -> list[str]:
     """Return the entries of a list such as "2.35, 1.38", or with repetitions, "8 x (2.35, 1.38), 2.35".
+
+    The paths of files may have commas and parentheses.
 
     Raises:
         RequestError: if it is no such list, or has too many entries.
@@ -177,13 +171,17 @@ def list_entries(name: str, text: str) -> list[str]:
     found: list[str] = []
     rest = text.strip()
     while rest:
-        repeated = re.match(r"(\d+)\s*[x×]\s*\(([^()]*)\)\s*(?:,|$)", rest)
-        single = re.match(r"([^,()]+)(?:,|$)", rest)
-        match = repeated or single
+        file = _leading_file(rest)
+        repeated = None if file else re.match(r"(\d+)\s*[x×]\s*\(((?:[^()]|\([^()]*\))*)\)\s*(?:,|$)", rest)
+        match = file or repeated or re.match(r"([^,()]+)(?:,|$)", rest)
         if match is None:
             raise RequestError(f"{name}: got {text!r}, wanted a list such as '2.35, 1.38' or '8 x (2.35, 1.38), 2.35'")
-        count, entries = (int(match[1]), match[2].split(",")) if repeated else (1, [match[1]])
-        entries = [entry.strip() for entry in entries]
+        if match is not file and re.match(r"\d+,\d+\s*(?:[,;]\s|$)", rest):
+            raise RequestError(
+                f"{name}: got {text!r}, a decimal comma? wanted a point, or, in a list of whole numbers, a space after "
+                "the comma"
+            )
+        count, entries = (int(repeated[1]), list_entries(name, repeated[2])) if repeated else (1, [match[1].strip()])
         if "" in entries or not 0 < count * len(entries) + len(found) <= MAX_FILMS:
             raise RequestError(f"{name}: got {text!r}, wanted a list of 1 to {MAX_FILMS} entries")
         found += count * entries
@@ -191,6 +189,15 @@ def list_entries(name: str, text: str) -> list[str]:
     if not found or text.rstrip().endswith(","):
         raise RequestError(f"{name}: got {text!r}, wanted a list of 1 to {MAX_FILMS} entries")
     return found
+
+
+def _leading_file(text: str) -> re.Match[str] | None:
+    """Return the longest beginning of a list that is the path of a file of an index, if there is one."""
+    for end in reversed([comma.start() for comma in re.finditer(",|$", text)]):
+        path = text[:end].strip()
+        if is_file(path) and Path(str(mi.file_resolver().resolve(path))).is_file():
+            return re.compile(f"(.{{{end}}})(?:,|$)", re.DOTALL).match(text)
+    return None
 
 
 class _Filmed(Material):
@@ -205,9 +212,6 @@ class _Filmed(Material):
     def __init__(self, below: Material, films: list[RefractiveIndex], scale: VaryingNumber) -> None:
         self.below, self.films, self.scale, self.outside = below, films, scale, below.outside
         self.transparent, self.dispersion = below.transparent, below.dispersion
-        grids = [nodes_of(film)[[0, -1]] for film in films if not film.is_constant]
-        shortest, longest = zip(below.wavelengths, *grids, strict=True)
-        self.wavelengths = float(max(shortest)), float(min(longest))
 
     @property
     def eta(self) -> Any:  # type: ignore[override]
@@ -217,11 +221,15 @@ class _Filmed(Material):
         """Return the thicknesses of the films in µm, and the bounds of their factor."""
         raise NotImplementedError
 
+    def known(self) -> tuple[KnownRange, ...]:
+        return (*self.below.known(), *(film.known("thin_film_ior") for film in self.films))
+
     def _check(self) -> None:
-        thicknesses, (low, high) = self.thicknesses()
-        if not np.isfinite(thicknesses).all() or thicknesses.min() < 0 or low < 0:
-            bad = min(float(thicknesses.min()), low)
-            raise RequestError(f"thin_film_thickness: got {bad:.6g}, wanted 0 to {MAX_THICKNESS:g} um")
+        if (scale := self.scale.values[0]) < 0:
+            raise RequestError(f"thin_film_scale: got {scale:.6g}, wanted 0 or more")
+        thicknesses, (_, high) = self.thicknesses()
+        if (bad := thicknesses[~(np.isfinite(thicknesses) & (thicknesses >= 0))]).size:
+            raise RequestError(f"thin_film_thickness: got {bad[0]:.6g}, wanted 0 to {MAX_THICKNESS:g} um")
         if (total := high * thicknesses.sum()) > MAX_THICKNESS * (1 + 1e-6):
             raise RequestError(
                 f"thin_film_thickness: got {total:.6g}, wanted 0 to {MAX_THICKNESS:g} um; a thicker layer is a coat "
@@ -306,7 +314,7 @@ class FilmedMaterial(_Filmed):
         low, high = self.thickness.values[[0, -1]]
         low_scale, high_scale = self.scale.values[[0, -1]]
         if low < 0 or high <= 0:
-            return np.array([low * low_scale]), (1.0, 1.0)
+            return np.array([low]), (1.0, 1.0)
         return np.array([high]), (float(low / high * low_scale), float(high_scale))
 
     def _waves(
@@ -344,7 +352,8 @@ class StackedMaterial(_Filmed):
             if not film.is_constant:
                 own = nodes_of(film)
                 first, last = min(first, own[0]), max(last, own[-1])
-        grid = np.linspace(first, last, min(round(last - first), MAX_INDEX_NODES) + 1)
+        max_nodes = 10 * MAX_INDEX_NODES // max(10, len(films))
+        grid = np.linspace(first, last, min(round(last - first), max_nodes) + 1)
         values = np.stack([film(grid * 1e-3) for film in films]) / self.outside
         self.table, self.nodes = PacketTable(np.stack([values.real, values.imag], -1), width=2), opaque(len(grid))
         self.first, self.per_nanometre = opaque(grid[0]), opaque((len(grid) - 1) / (grid[-1] - grid[0]))

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import drjit as dr
 import mitsuba as mi
 import numpy as np
@@ -26,7 +28,7 @@ class VaryingNumber:
             RequestError: if it is neither a number nor a texture whose values are known.
         """
         self.name, value = name, props.get(name, default)
-        if isinstance(value, str):
+        if isinstance(value := number_or_text(value), str):
             value = numbers_from(name, value)
         if not is_number(value) and not isinstance(value, mi.Texture):
             raise RequestError(f"{name}: got {value!r}, wanted a number or a texture")
@@ -70,6 +72,14 @@ class VaryingNumber:
     def __str__(self) -> str:
         low, high = self.values[[0, -1]]
         return f"{low:.6g} to {high:.6g}" if self.varies else str(self.value)
+
+
+def number_or_text(value: Any) -> Any:
+    """Return a text that is a number as a number, and all else as it is."""
+    try:
+        return float(value) if isinstance(value, str) else value
+    except ValueError:
+        return value
 
 
 def numbers_from(name: str, file: str, white: float = 1.0, others: str = "") -> mi.Texture:

@@ -22,6 +22,12 @@ from ..errors import RequestError
 from ..settings import VISIBLE
 
 MIN_INDEX, MAX_INDEX = 0.01, 100.0
+MAX_CLEAR_K = 1e-4  # of a transparent medium; glass of 0.1 mm with this k absorbs a fifth of green light
+_ASKED = 0.3, 1.1  # µm: what cannot be is refused there; elsewhere the range ends at it, as at the pole of a formula
+_MAX_FAR = 1e5  # of n and k elsewhere: metals have a thousand in the far infrared
+_MAX_NOISE = 5e-3  # of k, by which measured curves fall below 0
+_MAX_SPREAD = 0.05  # of n or k, relative, in rows of one wavelength
+_ROWS = 20_000  # at most, of a formula
 FILES = (".spd", ".csv", ".yml")
 NOMINAL_WAVELENGTH = float(np.sqrt(VISIBLE[0] * VISIBLE[1])) * 1e-3
 """µm, in the middle of visible light. Where one number stands for a medium with dispersion, it is n at this λ."""
@@ -79,13 +85,54 @@ DISPERSION: dict[str, tuple[int, tuple[float, ...], tuple[float, float], str]] =
 }
 
 
+@dataclass(frozen=True)
+class KnownRange:
+    """The wavelengths at which the index of a parameter is known.
+
+    Attributes:
+        parameter: that names the index.
+        source: the name of the medium or of the file.
+        wavelengths: (shortest, longest), nm.
+        clear: the index, of a medium that is taken as transparent; else None.
+    """
+
+    parameter: str
+    source: str
+    wavelengths: tuple[float, float]
+    clear: RefractiveIndex | None = None
+
+    def check(self, light: tuple[float, float]) -> None:
+        """Check that the index is known for light of wavelengths (shortest, longest), nm.
+
+        Raises:
+            RequestError: if it is not, or the light is absorbed where the medium is taken as transparent.
+        """
+        (first, last), (shortest, longest) = light, self.wavelengths
+        of_light = _nanometres(light)
+        if first < shortest * (1 - 1e-6) or last > longest * (1 + 1e-6):
+            raise RequestError(
+                f"{self.parameter}: got light of {of_light}, and a table of {_nanometres(self.wavelengths)} "
+                f"({self.source}); wanted light inside its range, or another index"
+            )
+        if self.clear is not None and (k := self.clear.max_k(light)) > MAX_CLEAR_K:
+            raise RequestError(
+                f"{self.parameter}: got light of {of_light}, and k up to {k:.3g} ({self.source}), wanted a transparent "
+                "medium; give it as material"
+            )
+
+
+def _nanometres(wavelengths: tuple[float, float]) -> str:
+    first, last = wavelengths
+    return f"{first:.6g} nm" if first == last else f"{first:.6g} to {last:.6g} nm"
+
+
 @dataclass(frozen=True, eq=False)
 class RefractiveIndex:
     """n + ik over the wavelength in vacuum, linear between the wavelengths of a table.
 
     Attributes:
         name: as it was requested.
-        wavelengths: µm, ascending, (J,); a single one of an index without dispersion.
+        wavelengths: µm, ascending, (J,); a single 0 of an index without dispersion.
         values: n + ik, (J,).
     """
 
@@ -123,12 +170,18 @@ class RefractiveIndex:
     @property
     def is_constant(self) -> bool:
         """Whether there is no dispersion."""
-        return len(self.values) == 1
+        return not self.wavelengths[0]
+
+    def max_k(self, light: tuple[float, float]) -> float:
+        """Return the maximum of k at wavelengths (shortest, longest), nm."""
+        first, last = (1e-3 * wavelength for wavelength in light)
+        inside = self.wavelengths[(self.wavelengths > first) & (self.wavelengths < last)]
+        return float(self([first, *inside, last]).imag.max())
 
     @property
     def absorbs(self) -> bool:
-        """Whether k > 0 at any wavelength."""
-        return bool(self.values.imag.any())
+        """Whether k is above that of clear glass in visible light."""
+        return self.max_k(VISIBLE) > MAX_CLEAR_K
 
     @property
     def range(self) -> tuple[float, float]:
@@ -136,6 +189,10 @@ class RefractiveIndex:
         if self.is_constant:
             return 0.0, np.inf
         return float(self.wavelengths[0] * 1e3), float(self.wavelengths[-1] * 1e3)
+
+    def known(self, parameter: str, clear: bool = False) -> KnownRange:
+        """Return where the index is known, for a parameter that names it; `clear`: taken as transparent there."""
+        return KnownRange(parameter, self.name, self.range, self if clear else None)
 
     def __str__(self) -> str:
         return self.name
@@ -160,7 +217,10 @@ def index_of(name: str, index: complex | str | os.PathLike[str]) -> RefractiveIn
     """
     if isinstance(index, str | os.PathLike):
         if is_file(index):
-            return read_index(index)
+            try:
+                return read_index(index)
+            except RequestError as error:
+                raise RequestError(f"{name}: {error}") from None
         if (medium := _medium(str(index))) is not None:
             return medium
         if name == "int_ior":
@@ -201,15 +261,8 @@ def refractive_index(
     name, value = ("int_ior", int_ior) if material is None else ("material", material)
     assert value is not None
     index = index_of(name, value)
-    shortest, longest = index.range
-    if name == "material" and not is_dispersive(value):
-        # Conductors are constant in visible light where the table ends.
-        shortest, longest = min(shortest, VISIBLE[0]), max(longest, VISIBLE[1])
-    if known and not shortest * (1 - 1e-6) <= wavelength * 1e3 <= longest * (1 + 1e-6):
-        raise RequestError(
-            f"{name}: got {value!r} at {wavelength * 1e3:g} nm, wanted a wavelength from {shortest:.4g} to "
-            f"{longest:.4g} nm, where its index is known; elsewhere give n + ik as int_ior"
-        )
+    if known:
+        index.known(name).check((wavelength * 1e3, wavelength * 1e3))
     return complex(index(wavelength))
 
 
@@ -243,6 +296,8 @@ def _near(name: str, known: list[str]) -> list[str]:
 def conductor(material: str) -> RefractiveIndex:
     """Return the index of a conductor from the tables of Mitsuba and of this package.
 
+    It is constant in visible light where its table ends.
+
     Raises:
         RequestError: if no material has this name.
     """
@@ -256,15 +311,17 @@ def conductor(material: str) -> RefractiveIndex:
             wanted = " or ".join(near)
         raise RequestError(f"material: got {material!r}, {'did you mean' if near else 'wanted'} {wanted}")
     found = read_index(paths[material])
-    return RefractiveIndex(material, found.wavelengths, found.values)
+    first, last = min(found.wavelengths[0], VISIBLE[0] * 1e-3), max(found.wavelengths[-1], VISIBLE[1] * 1e-3)
+    wavelengths = np.unique([first, *found.wavelengths, last])
+    return RefractiveIndex(material, wavelengths, found(wavelengths))
 
 
 def read_index(path: str | os.PathLike[str]) -> RefractiveIndex:
-    """Read n + ik from a file.
+    """Read n + ik from a file; it is known where both n and k are.
 
     `.spd`: columns of the wavelength in nm and n, and k if there is a third one; beside `NAME.eta.spd`, `NAME.k.spd`
-    has k, as in Mitsuba. `.csv` and `.yml`: as refractiveindex.info writes them, with wavelengths in µm. Supported
-    formulas: 1 and 2 (Sellmeier), 3 (polynomial) and 5 (Cauchy).
+    has k, as in Mitsuba. `.csv` and `.yml`: as refractiveindex.info writes them, with wavelengths in µm: tables, and
+    its dispersion formulas.
 
     Raises:
         FileNotFoundError: if there is no such file.
@@ -273,48 +330,109 @@ def read_index(path: str | os.PathLike[str]) -> RefractiveIndex:
     path = Path(path)
     if not path.is_file():
         raise FileNotFoundError(f"{path}: no such file")
-    of_file = path.stat()
-    return _read(path, of_file.st_mtime_ns, of_file.st_size)
+    of_k = _path_of_k(path)
+    return _read(
+        path, *(stat for file in (path, of_k) if file for stat in (file.stat().st_mtime_ns, file.stat().st_size))
+    )
+
+
+def _path_of_k(path: Path) -> Path | None:
+    """Return the file of k beside a file of n, `NAME.eta.spd`, if there is one."""
+    of_k = path.with_name(path.name.removesuffix(".eta.spd") + ".k.spd")
+    return of_k if path.name.endswith(".eta.spd") and of_k.is_file() else None
 
 
 @functools.lru_cache(maxsize=64)
-def _read(path: Path, changed: int, size: int) -> RefractiveIndex:
-    """Return the index in a file, read once for each state of it."""
+def _read(path: Path, *state: int) -> RefractiveIndex:
+    """Return the index in a file, read once for each state of it and of the file of k beside it."""
     try:
         of_n, of_k = {".spd": _read_spd, ".csv": _read_csv, ".yml": _read_yml}[path.suffix.lower()](path)
+        of_n, of_k = _ascending(of_n, "n"), None if of_k is None else _ascending(of_k, "k")
+        _check_unit(of_n[0], path.suffix.lower())
+        wavelengths, n, k = _where_known(of_n, of_k)
+        start, stop = _possible_rows(wavelengths, n, k)
     except RequestError as error:
         raise RequestError(f"{path}: {error}") from None
     except (ValueError, KeyError, TypeError, IndexError, AttributeError) as error:
         text = str(error).splitlines()[0] if str(error) else type(error).__name__
         raise RequestError(f"{path}: not a table of refractive indices ({text})") from None
-    for table, what in ((of_n, "n"), (of_k, "k")):
-        if table is None:
-            continue
-        if not (np.isfinite(table).all() and (np.diff(table[0]) > 0).all() and table[0, 0] > 0):
-            raise RequestError(f"{path}: got wavelengths of {what} that do not ascend, or numbers that are not finite")
-        low = MIN_INDEX if what == "n" else 0.0
-        if table[1].min() < low or table[1].max() > MAX_INDEX:
-            bad = table[1].min() if table[1].min() < low else table[1].max()
-            raise RequestError(f"{path}: got {what} = {bad:g}, wanted {what} from {low:g} to {MAX_INDEX:g}")
-    first, last = of_n[0, [0, -1]]
-    # A visible table that was read in the other unit lies three powers of ten outside.
-    unit, other = ("nm", "µm") if path.suffix.lower() == ".spd" else ("µm", "nm")
+    index = n[start:stop] + 1j * np.maximum(k[start:stop], 0)
+    return RefractiveIndex(path.name, wavelengths[start:stop], index)
+
+
+def _ascending(table: _Table, what: str) -> _Table:
+    """Return the rows of a table by their wavelength; those of one wavelength are one, their mean.
+
+    Raises:
+        RequestError: if rows of one wavelength differ, or there are several tables in one.
+    """
+    if not (np.isfinite(table[0]).all() and table[0].min() > 0):
+        raise RequestError(f"got wavelengths of {what} that are not positive numbers")
+    if table[0, 0] > table[0, -1]:
+        table = table[:, ::-1]
+    order = np.argsort(table[0], kind="stable")
+    if 2 * np.count_nonzero(order != np.arange(len(order))) > len(order):
+        raise RequestError(f"got wavelengths of {what} that neither ascend nor descend, wanted one table")
+    wavelengths, row, count = np.unique(table[0], return_inverse=True, return_counts=True)
+    value = np.bincount(row, table[1]) / count
+    differs = np.abs(table[1] - value[row]) > _MAX_SPREAD * np.abs(value[row]) + 1e-3
+    if differs.any():
+        at = table[0, differs][0]
+        both = " and ".join(f"{v:g}" for v in table[1, table[0] == at])
+        raise RequestError(f"got {what} = {both} at {at * 1e3:g} nm, wanted one value for each wavelength")
+    return np.stack([wavelengths, value])
+
+
+def _check_unit(wavelengths: _Table, suffix: str) -> None:
+    """Check the wavelengths of a table, µm.
+
+    Raises:
+        RequestError: if they are three powers of ten off, as those of visible light in the other unit.
+    """
+    first, last = wavelengths[[0, -1]]
+    unit, other = ("nm", "µm") if suffix == ".spd" else ("µm", "nm")
     if first > 50 or last < 0.02:
         scale = 1e3 if unit == "nm" else 1.0
         raise RequestError(
-            f"{path}: got wavelengths from {first * scale:g} to {last * scale:g} {unit}: a table in {other}? "
-            f"{path.suffix} files have {unit}"
+            f"got wavelengths from {first * scale:g} to {last * scale:g} {unit}: a table in {other}? "
+            f"{suffix} files have {unit}"
         )
+
+
+def _where_known(of_n: _Table, of_k: _Table | None) -> tuple[_Table, _Table, _Table]:
+    """Return the wavelengths at which both n and k are known, with n and k; k = 0 without a table of it.
+
+    Raises:
+        RequestError: if there are none.
+    """
     if of_k is None:
-        return RefractiveIndex(path.name, of_n[0], of_n[1] + 0j)
-    if of_k[0, 0] > of_n[0, 0] * (1 + 1e-6) or of_k[0, -1] < of_n[0, -1] * (1 - 1e-6):
-        raise RequestError(
-            f"{path}: got n from {first * 1e3:g} to {last * 1e3:g} nm and k from {of_k[0, 0] * 1e3:g} to "
-            f"{of_k[0, -1] * 1e3:g} nm, wanted k wherever n is known"
-        )
+        return of_n[0], of_n[1], np.zeros_like(of_n[1])
+    first, last = (choose(of_n[0, end], of_k[0, end]) for end, choose in ((0, max), (-1, min)))
+    if first > last:
+        ranges = (f"{table[0, 0] * 1e3:g} to {table[0, -1] * 1e3:g} nm" for table in (of_n, of_k))
+        raise RequestError("got n from {} and k from {}, wanted both at the same wavelengths".format(*ranges))
     both = np.union1d(of_n[0], of_k[0])
-    both = both[(both >= of_n[0, 0]) & (both <= of_n[0, -1])]
-    return RefractiveIndex(path.name, both, np.interp(both, *of_n) + 1j * np.interp(both, *of_k))
+    both = both[(both >= first) & (both <= last)]
+    return both, np.interp(both, *of_n), np.interp(both, *of_k)
+
+
+def _possible_rows(wavelengths: _Table, n: _Table, k: _Table) -> tuple[int, int]:
+    """Return (first, end) of the rows whose n and k can be; those in `_ASKED` all are.
+
+    Raises:
+        RequestError: if one of these cannot be, or, without one there, any row.
+    """
+    asked = (wavelengths >= _ASKED[0]) & (wavelengths <= _ASKED[1])
+    limit = np.where(asked, MAX_INDEX, _MAX_FAR)
+    asked |= not asked.any()
+    of_both = [("n", n, (n >= MIN_INDEX) & (n <= limit)), ("k", k, (k >= -_MAX_NOISE) & (k <= limit))]
+    for what, values, can_be in of_both:
+        if (bad := np.flatnonzero(asked & ~can_be)).size:
+            low = MIN_INDEX if what == "n" else 0.0
+            raise RequestError(f"got {what} = {values[bad[0]]:g}, wanted {what} from {low:g} to {limit[bad[0]]:g}")
+    wrong, rows = np.flatnonzero(~(of_both[0][2] & of_both[1][2])), np.flatnonzero(asked)
+    before, after = wrong[wrong < rows[0]], wrong[wrong > rows[-1]]
+    return int(before[-1]) + 1 if before.size else 0, int(after[0]) if after.size else len(n)
 
 
 _Table = NDArray[np.float64]
@@ -337,9 +455,8 @@ def _read_spd(path: Path) -> _Tables:
             raise RequestError("got one column, wanted wavelengths in nm and n")
         return table * np.array([1e-3, *[1.0] * (len(table) - 1)])[:, None]
 
-    table = columns(path)
-    of_k = path.with_name(path.name.removesuffix(".eta.spd") + ".k.spd")
-    if path.name.endswith(".eta.spd") and of_k.is_file():
+    table, of_k = columns(path), _path_of_k(path)
+    if of_k is not None:
         return table[:2], columns(of_k)[:2]
     return table[:2], table[[0, 2]] if len(table) > 2 else None
 
@@ -382,7 +499,8 @@ def _read_yml(path: Path) -> _Tables:
         else:
             first, last = (float(x) for x in str(entry.get("wavelength_range", entry.get("range"))).split())
             # As finely as the fastest dispersion that tables of visible light show.
-            wavelengths = np.linspace(first, last, max(2, min(int((last - first) * 1e3) + 1, 20_000)))
+            count = max(2, int((last - first) * 1e3) + 1)
+            wavelengths = np.linspace(first, last, count) if count <= _ROWS else np.geomspace(first, last, _ROWS)
             coefficients = tuple(float(x) for x in str(entry["coefficients"]).split())
             of_n = np.stack([wavelengths, _formula(int(which), coefficients, wavelengths)])
     if of_n is None:
@@ -391,18 +509,36 @@ def _read_yml(path: Path) -> _Tables:
 
 
 def _formula(number: int, coefficients: tuple[float, ...], wavelength: _Table) -> _Table:
-    """Return n(λ) of the dispersion formulas 1, 2, 3 and 5 of refractiveindex.info, λ in µm.
+    """Return n(λ) of the dispersion formulas of refractiveindex.info, λ in µm; missing coefficients are 0.
 
     n² − 1 = C₁ + Σ C₂ᵢ λ²/(λ² − C₂ᵢ₊₁²) (1, Sellmeier; 2: C₂ᵢ₊₁ not squared), n² = C₁ + Σ C₂ᵢ λ^C₂ᵢ₊₁ (3),
-    n = C₁ + Σ C₂ᵢ λ^C₂ᵢ₊₁ (5, Cauchy).
+    n² = C₁ + C₂ λ^C₃/(λ² − C₄^C₅) + C₆ λ^C₇/(λ² − C₈^C₉) + Σ C₁₀ λ^C₁₁ (4), n = C₁ + Σ C₂ᵢ λ^C₂ᵢ₊₁ (5, Cauchy),
+    n − 1 = C₁ + Σ C₂ᵢ/(C₂ᵢ₊₁ − λ⁻²) (6, gases), n = C₁ + C₂ L + C₃ L² + C₄ λ² + C₅ λ⁴ + C₆ λ⁶ with
+    L = 1/(λ² − 0.028) (7, Herzberger), (n² − 1)/(n² + 2) = C₁ + C₂ λ²/(λ² − C₃) + C₄ λ² (8),
+    n² = C₁ + C₂/(λ² − C₃) + C₄ (λ − C₅)/((λ − C₅)² + C₆) (9).
     """
-    if number not in (1, 2, 3, 5):
-        raise RequestError(f"got dispersion formula {number}, wanted 1, 2, 3 or 5, or a table")
-    first, pairs = coefficients[0], list(zip(coefficients[1::2], coefficients[2::2], strict=True))
-    if number in (3, 5):
-        total = first + sum(c * wavelength**power for c, power in pairs)
-        result = np.sqrt(total) if number == 3 else total
-    else:
-        square = wavelength**2
-        result = np.sqrt(1 + first + sum(c * square / (square - (x**2 if number == 1 else x)) for c, x in pairs))
-    return np.asarray(result, np.float64)
+    if not 1 <= number <= 9:
+        raise RequestError(f"got dispersion formula {number}, wanted 1 to 9, or a table")
+    c = [*coefficients, *[0.0] * (9 - len(coefficients)), *[0.0] * (len(coefficients) % 2 == 0)]
+    first, pairs, square = c[0], list(zip(c[1::2], c[2::2], strict=False)), wavelength**2
+    with np.errstate(invalid="ignore", divide="ignore"):  # outside of its range of validity
+        if number in (1, 2):
+            found = 1 + first + sum(a * square / (square - (b**2 if number == 1 else b)) for a, b in pairs)
+        elif number == 4:
+            # Without the terms that are left out: theirs would be 0/0 at 1 µm.
+            poles = (c[k] * wavelength ** c[k + 1] / (square - c[k + 2] ** c[k + 3]) for k in (1, 5) if c[k])
+            found = first + sum(poles) + sum(a * wavelength**b for a, b in pairs[4:])
+        elif number == 6:
+            found = 1 + first + sum(a / (b - 1 / square) for a, b in pairs)
+        elif number == 7:
+            pole = 1 / (square - 0.028)
+            found = first + c[1] * pole + c[2] * pole**2 + c[3] * square + c[4] * square**2 + c[5] * square**3
+        elif number == 8:
+            ratio = first + c[1] * square / (square - c[2]) + c[3] * square
+            found = (1 + 2 * ratio) / (1 - ratio)
+        elif number == 9:
+            step = wavelength - c[4]
+            found = first + c[1] / (square - c[2]) + c[3] * step / (step**2 + c[5])
+        else:
+            found = first + sum(a * wavelength**b for a, b in pairs)
+        return np.asarray(np.sqrt(found) if number in (1, 2, 3, 4, 8, 9) else found, np.float64)

@@ -81,7 +81,7 @@ def test_light_that_a_table_lacks_is_refused_with_its_range(llvm):
     for bsdf, film, message in (
         (saved, None, r"light from 360 nm, .* from 500 nm: build it from 36"),
         (visible, (300, 400), r"light from 300 nm, .* from 360 nm: build it from 300"),
-        (metal, (850, 950), r"material: got light of 850 to 950 nm, and a table of 299 to 885 nm \(conductor, Al"),
+        (metal, (850, 950), r"material: got light of 850 to 950 nm, and a table of 298.757 to 885.601 nm \(Al\)"),
         ({"type": "twosided", "bsdf": metal}, (850, 950), "material: got light of 850 to 950 nm"),
     ):
         with pytest.raises(RuntimeError, match=message) as found:
@@ -145,7 +145,9 @@ def test_light_that_reaches_a_loaded_scene_is_not_black(llvm, change):
 def test_a_sensor_of_light_outside_a_table_is_refused(llvm):
     metal = {**GRATING, "conserve_energy": False, "material": "Al"}
     sensor = mi.load_dict(scene(metal, (850, 950))["sensor"])
-    with pytest.raises(ValueError, match="material: got light of 850 to 950 nm, and a table of 299 to 885 nm"):
+    with pytest.raises(
+        ValueError, match=r"material: got light of 850 to 950 nm, and a table of 298\.757 to 885\.601 nm"
+    ):
         mi.render(mi.load_dict(scene(metal)), sensor=sensor, spp=1)
 
 
@@ -248,3 +250,153 @@ def test_the_light_of_the_scene_decides_on_the_shortest_window(llvm):
 def test_a_flat_mirror_with_a_window_of_one_wavelength_reflects_nearly_all_light(llvm, theta):
     found = albedo(mi.load_dict(flat(0.7)), direction(theta, 0), wavelengths=[700.0] * 4)
     np.testing.assert_allclose(found, 1, atol=0.17)
+
+
+def table(folder, name, rows):
+    """The path of a table (λ in µm, n, k)."""
+    path = folder / name
+    path.write_text("wl,n,k\n" + "".join(f"{row}\n" for row in rows))
+    return str(path)
+
+
+ENDS = {
+    "inside visible light": (["0.42,1.70,0", "0.68,1.60,0"], "420 to 680 nm"),
+    "in the infrared": (["2,3.45,0", "5,3.42,0"], "2000 to 5000 nm"),
+    "at its only row": (["0.5876,1.6,0"], "587.6 nm"),
+}
+# Parameters that name an index, with the file in the place of "{}"; R at normal incidence if its n is N.
+N = 2.2
+BELOW = 3.0
+
+
+def of_films(*thicknesses):
+    """R of films of the index N, or 1.5 for the first of several, on BELOW, over 3 to 3.2 µm."""
+    found = []
+    for wavelength in np.linspace(3.0, 3.2, 50):
+        above, r = BELOW, 0.0
+        for k, d in reversed(list(enumerate(thicknesses))):
+            n = 1.5 if k < len(thicknesses) - 1 else N
+            face = (n - above) / (n + above)
+            r = (face + r) / (1 + face * r) * np.exp(4j * np.pi * n * d / wavelength)
+            above = n
+        face = (1 - above) / (1 + above)
+        found.append(abs((face + r) / (1 + face * r)) ** 2)
+    return float(np.mean(found))
+
+
+def fresnel(n):
+    return ((n - 1) / (n + 1)) ** 2
+
+
+NAMED = {
+    "material": ({"material": "{}"}, fresnel(N)),
+    "int_ior": ({"int_ior": "{}"}, fresnel(N)),
+    # Radiance is n² times smaller outside.
+    "int_ior, transmission": ({"int_ior": "{}", "transmission": "interface"}, fresnel(N) + (1 - fresnel(N)) / N**2),
+    "ext_ior": ({"int_ior": BELOW, "ext_ior": "{}"}, fresnel(BELOW / N)),
+    "coat_ior": (
+        {"int_ior": BELOW, "coat_ior": "{}"},
+        fresnel(N) + (1 - fresnel(N)) ** 2 * fresnel(BELOW / N),
+    ),
+    "thin_film_ior": ({"int_ior": BELOW, "thin_film_ior": "{}", "thin_film_thickness": 0.3}, of_films(0.3)),
+    "thin_film_ior, list": (
+        {"int_ior": BELOW, "thin_film_ior": "1.5, {}", "thin_film_thickness": "0.4, 0.2"},
+        of_films(0.4, 0.2),
+    ),
+}
+FLAT = {**GRATING, "depth": 0.0, "coherence_length": 65.0, "conserve_energy": False}
+
+
+def with_file(named, file):
+    given = {name: v.replace("{}", file) if isinstance(v, str) else v for name, v in NAMED[named][0].items()}
+    return {**FLAT, **given}
+
+
+@pytest.mark.few(9)
+@pytest.mark.parametrize("end", ENDS)
+@pytest.mark.parametrize("named", NAMED)
+def test_light_that_a_file_of_an_index_lacks_is_refused_by_parameter_file_and_ranges(llvm, tmp_path, named, end):
+    # Regression: the index was constant beyond the table, without a word.
+    rows, known = ENDS[end]
+    bsdf, parameter = with_file(named, table(tmp_path, "glass.csv", rows)), named.partition(",")[0]
+    refusal = rf"{parameter}: got light of 360 to 830 nm, and a table of {known} \(glass\.csv\)"
+    with pytest.raises(RuntimeError, match=refusal):
+        mi.load_dict(scene(bsdf))
+
+
+@pytest.mark.few(2)
+@pytest.mark.parametrize("named", NAMED)
+def test_an_infrared_table_is_the_index_in_infrared_light(llvm, tmp_path, named):
+    # Elsewhere another one; but media above, and directions of transmitted light, have one index where tables begin.
+    n = N if named in ("int_ior, transmission", "ext_ior", "coat_ior") else 1.2
+    file = table(tmp_path, "infrared.csv", [f"{x},{y},0" for x, y in ((2, n), (2.9, n), (2.96, N), (3.24, N), (5, n))])
+    assert mean(with_file(named, file), (3000.0, 3200.0)) == pytest.approx(NAMED[named][1], rel=0.02)
+
+
+@pytest.mark.parametrize("named", ["int_ior", "ext_ior", "coat_ior"])
+def test_a_medium_that_absorbs_infrared_light_is_transparent_only_in_visible_light(llvm, tmp_path, named):
+    file = table(tmp_path, "water.csv", ["0.3,1.3,1e-7", "1,1.3,1e-6", "3,1.4,0.3", "4,1.4,0.01"])
+    mi.load_dict(scene(with_file(named, file)))
+    with pytest.raises(RuntimeError, match=rf"{named}: got light of 2900 to 3100 nm, and k up to 0\.3 \(water\.csv\)"):
+        mi.load_dict(scene(with_file(named, file), (2900, 3100)))
+
+
+@pytest.mark.parametrize("n", [3.45, "BK7"])
+def test_a_material_without_absorption_reflects_as_a_dielectric(llvm, tmp_path, n):
+    # Regression: "no probability mass found!"
+    file = n if n == "BK7" else table(tmp_path, "clear.csv", ["0.3,3.45,0", "0.9,3.45,0"])
+    found = albedo(mi.load_dict({**FLAT, "material": file}), direction(60, 40), wavelengths=[550.0] * 4)
+    cos = np.cos(np.deg2rad(60))
+    eta = 1.5185 if n == "BK7" else n
+    inside = np.sqrt(eta**2 - 1 + cos**2)
+    s, p = (cos - inside) / (cos + inside), (eta**2 * cos - inside) / (eta**2 * cos + inside)
+    np.testing.assert_allclose(found, (s**2 + p**2) / 2, rtol=0.01)
+
+
+def spectrum_of(*values):
+    return {"type": "irregular", "wavelengths": "450, 500, 650", "values": ", ".join(map(str, values))}
+
+
+@pytest.mark.parametrize(
+    ("eta", "k", "refusal"),
+    [
+        (spectrum_of(1, 1, 1), 3.0, "eta: got light of 360 to 830 nm, and a table of 450 to 650 nm"),
+        (1.0, spectrum_of(3, 3, 3), "k: got light of 360 to 830 nm, and a table of 450 to 650 nm"),
+        (
+            {"type": "checkerboard", "color0": spectrum_of(1, 1, 1), "color1": 2.0},
+            *(3.0, "eta: got light of 360 to 830 nm, and a table of 450 to 650 nm"),
+        ),
+        (spectrum_of(1, 1000, 1), 3.0, "eta: got [0-9.]+, wanted 0 to 100"),
+        *((bad, 3.0, f"eta: got {bad}, wanted 0 to 100") for bad in (float("nan"), -1, 101.5)),
+        *((1.0, bad, f"k: got {bad}, wanted 0 to 100") for bad in (float("nan"), -1, 101.5)),
+        (0.0, 0.0, r"eta: got an index eta \+ ik of 0, wanted 0.01 to 100"),
+        ("bitmap", 3.0, "eta: got -1, wanted 0 to 100"),
+    ],
+)
+def test_spectra_that_end_inside_the_light_or_are_no_index_are_refused(llvm, eta, k, refusal):
+    # Regression: R was 1 beyond the ends, and NaN under a film.
+    if eta == "bitmap":
+        pixels = np.ones((40, 50, 1), np.float32)
+        pixels[33, 21] = -1
+        eta = {"type": "bitmap", "bitmap": mi.Bitmap(pixels), "raw": True}
+    with pytest.raises(RuntimeError, match=refusal):
+        mi.load_dict(scene({**FLAT, "eta": eta, "k": k}))
+
+
+@pytest.mark.parametrize("bad", [float("nan"), -1.0, 1e30])
+@pytest.mark.parametrize("name", ["eta", "k"])
+def test_an_index_that_becomes_none_is_refused(llvm, name, bad):
+    parameters = mi.traverse(mi.load_dict({**FLAT, "eta": 1.0, "k": 3.0}))
+    parameters[f"{name}.value"] = bad
+    with pytest.raises(ValueError, match=f"{name}: got {bad:g}".replace("+", r"\+") + ", wanted 0 to 100"):
+        parameters.update()
+
+
+def test_a_spectrum_that_comes_to_end_inside_the_light_is_refused(llvm):
+    of_metal = {"type": "irregular", "wavelengths": "350, 500, 850", "values": "1, 1, 1"}
+    loaded = mi.load_dict(scene({**FLAT, "eta": of_metal, "k": 3.0}))
+    parameters = mi.traverse(loaded)
+    parameters["grating.bsdf.eta.wavelengths"] = [450.0, 500.0, 650.0]
+    parameters.update()
+    with pytest.raises(ValueError, match="eta: got light of 360 to 830 nm, and a table of 450 to 650 nm"):
+        mi.render(loaded, spp=1)

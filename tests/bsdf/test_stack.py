@@ -217,7 +217,14 @@ def test_thicknesses_are_updated_and_have_derivatives(llvm):
         ({"thin_film_ior": "2, 3", "thin_film_thickness": "0.1, -0.2"}, "got -0.2, wanted 0 to 4 um"),
         ({"thin_film_ior": "2, zinc", "thin_film_thickness": "0.1, 0.2"}, "thin_film_ior: got 'zinc'"),
         ({"thin_film_scale": 2.0}, "thin_film_scale: got it alone"),
-        ({"thin_film_ior": 2.0, "thin_film_thickness": 0.1, "thin_film_scale": -1.0}, "got -1, wanted 0 to 4 um"),
+        (
+            {"thin_film_ior": 2.0, "thin_film_thickness": 0.1, "thin_film_scale": -1.0},
+            "thin_film_scale: got -1, wanted 0",
+        ),
+        ({"thin_film_ior": "2, 3", "thin_film_thickness": "inf, .1"}, "thin_film_thickness: got inf, wanted 0 to 4"),
+        ({"thin_film_ior": "1,45", "thin_film_thickness": "0,1"}, "thin_film_ior: got '1,45', a decimal comma"),
+        ({"thin_film_ior": 1.45, "thin_film_thickness": "0,1"}, "thin_film_thickness: got '0,1', a decimal comma"),
+        ({"thin_film_ior": "1,45, 2,35", "thin_film_thickness": "0,1, 0,2"}, "a decimal comma"),
         ({"int_ior": "Al"}, "int_ior: got 'Al', wanted a number, a file"),
         ({"int_ior": "nowhere.yml"}, "no such file"),
         ({"k": 3.0}, "k: got k, wanted eta and k"),
@@ -231,6 +238,29 @@ def test_wrong_stacks_and_indices_are_refused_in_one_line(llvm, films, message):
     with pytest.raises(RuntimeError, match=message) as error:
         mi.load_dict({**base, **films})
     assert "\n" not in str(error.value).partition("RequestError: ")[2].strip()
+
+
+def test_films_from_files_whose_names_have_commas_and_parentheses(llvm, tmp_path):
+    # Regression: "Malitson (1).csv" was no list.
+    paths = []
+    for k, name in enumerate(("Malitson (1).csv", "Malitson, 1965.csv")):
+        paths.append(str(tmp_path / name))
+        (tmp_path / name).write_text(f"wl,n\n0.3,{1.5 + k}\n0.9,{1.5 + k}\n")
+    first, second = paths
+    for iors, thicknesses, wanted in (
+        (first, 0.1, [1.5]),
+        (second, "0.1", [2.5]),
+        (f"{first}, 2, {second}", ".1, .1, .1", [1.5, 2, 2.5]),
+        (f"2 x ({second}, {first}), 1.38", "5 x (.1)", [2.5, 1.5, 2.5, 1.5, 1.38]),
+    ):
+        films = material_of(load(int_ior=1.5, thin_film_ior=iors, thin_film_thickness=thicknesses)).films
+        assert [film.nominal for film in films] == pytest.approx(wanted)
+
+
+def test_one_film_given_as_texts_is_one_film(llvm):
+    texts = load(int_ior=1.5, thin_film_ior="1.38", thin_film_thickness="0.1", thin_film_scale="2")
+    numbers = load(int_ior=1.5, thin_film_ior=1.38, thin_film_thickness=0.1, thin_film_scale=2.0)
+    assert str(material_of(texts)) == str(material_of(numbers))
 
 
 def test_spectra_of_eta_and_k_are_those_of_the_conductor(llvm):

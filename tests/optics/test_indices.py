@@ -93,6 +93,109 @@ def test_a_file_has_its_index(tmp_path, name, text, wanted):
     assert complex(found(0.6)) == pytest.approx(complex(wanted), abs=tolerance)
 
 
+def by_hand(number, c, x):
+    """n of a formula of refractiveindex.info, from its document, coefficient by coefficient."""
+    c = [0.0, *c, *[0.0] * (18 - len(c))]
+    if number in (1, 2):
+        poles = [c[i] ** (2 if number == 1 else 1) for i in range(3, 18, 2)]
+        return np.sqrt(1 + c[1] + sum(c[2 + 2 * i] / (1 - pole / x**2) for i, pole in enumerate(poles)))
+    if number in (3, 5):
+        n = c[1] + sum(c[i] * x ** c[i + 1] for i in range(2, 17, 2))
+        return np.sqrt(n) if number == 3 else n
+    if number == 4:
+        n = c[1] + c[2] * x ** c[3] / (x**2 - c[4] ** c[5]) + c[6] * x ** c[7] / (x**2 - c[8] ** c[9])
+        return np.sqrt(n + sum(c[i] * x ** c[i + 1] for i in range(10, 17, 2)))
+    if number == 6:
+        return 1 + c[1] + sum(c[i] / (c[i + 1] - x**-2) for i in range(2, 17, 2))
+    if number == 7:
+        return c[1] + c[2] / (x**2 - 0.028) + c[3] / (x**2 - 0.028) ** 2 + c[4] * x**2 + c[5] * x**4 + c[6] * x**6
+    if number == 8:
+        lorentz = c[1] + c[2] * x**2 / (x**2 - c[3]) + c[4] * x**2
+        return np.sqrt((1 + 2 * lorentz) / (1 - lorentz))
+    return np.sqrt(c[1] + c[2] / (x**2 - c[3]) + c[4] * (x - c[5]) / ((x - c[5]) ** 2 + c[6]))
+
+
+FORMULAS = [
+    (1, "0.1 0.6 0.07 0.4 0.12 0.9 9.9"),
+    (2, "0.2 1.1 0.02 0.3"),  # the pole of the last term is 0
+    (3, "2.7 -0.01 2 0.02 -2 1e-3 -4 0.05"),
+    (4, "2.2 0.3 1 0.1 2 0.02 2 9 2 -0.01 2 0.003 -4"),
+    (4, "2.7 0.02 0 0.12 2"),  # at 1 µm a term without coefficients would be 0/0
+    (5, "1.5 0.004 -2 1e-4 -4"),
+    (6, "0 0.06 238 0.002 57"),
+    (7, "3.4 0.14 0.03 -1e-3 1e-4 -1e-5"),
+    (8, "0.3 0.1 0.02 -1e-3"),
+    (9, "2.5 0.02 0.05 0.01 0.2 0.3"),
+]
+
+
+@pytest.mark.parametrize(("number", "coefficients"), FORMULAS)
+def test_a_formula_has_its_index(tmp_path, number, coefficients):
+    # Known to 400 µm, which leaves its rows in visible light as near to each other, where it is one number there.
+    first, last = 0.3, 400.0 if number in (1, 5, 6) else 1.4
+    text = f"formula {number}\n    wavelength_range: {first} {last}\n    coefficients: {coefficients}"
+    found = read_index(write(tmp_path, "a.yml", YML.format(text)))
+    x = np.random.default_rng(3).uniform(0.4, 1.4, 200)
+    # Linear between rows of 1 nm: h² n″/8 where the index rises fastest.
+    np.testing.assert_allclose(found(x), by_hand(number, [*map(float, coefficients.split())], x), rtol=1e-5)
+
+
+NK = YML.format("tabulated nk\n    data: |\n        {}")
+PAGES = {
+    # text, range in nm, n + ik at 0.6 µm
+    "k narrower than n": (
+        YML.format("tabulated n\n    data: |\n        0.2 1.5\n        1.0 1.9\n")
+        + "  - type: tabulated k\n    data: |\n        0.31 0.2\n        0.7 0.2\n",
+        (310, 700),
+        1.7 + 0.2j,
+    ),
+    "metal of the far infrared": (
+        NK.format("0.4 1.0 6.0\n        0.8 2.0 8.0\n        200 300 420"),
+        (400, 2e5),
+        1.5 + 7j,
+    ),
+    "equal rows": (
+        NK.format("0.4 1.6 0.1\n        0.6 1.5 0.3\n        0.6 1.5 0.3\n        1 1 0"),
+        (400, 1e3),
+        1.5 + 0.3j,
+    ),
+    "nearly equal rows": (
+        NK.format("0.4 1.6 0.1\n        0.6 1.5 0.3\n        0.6 1.52 0.304\n        1 1 0"),
+        (400, 1e3),
+        1.51 + 0.302j,
+    ),
+    "noise about k = 0": (NK.format("0.4 1.6 0.1\n        0.6 1.5 -0.0002\n        1 1 -0.004"), (400, 1e3), 1.5),
+    "by photon energy": (NK.format("1 1 0\n        0.6 1.5 0.1\n        0.4 1.6 0.2"), (400, 1e3), 1.5 + 0.1j),
+    "exchanged rows": (
+        NK.format("0.4 1.6 0\n        0.6 1.5 0.1\n        1 1 0\n        0.9 1 0\n        1.2 1 0"),
+        (400, 1200),
+        1.5 + 0.1j,
+    ),
+    "impossible outside of 0.3 to 1.1 µm": (
+        NK.format("0.2 -9 0\n        0.21 1.7 0\n        0.6 1.5 0.1\n        2 1 0\n        3 1 -2\n        4 1 1"),
+        (210, 2000),
+        1.5 + 0.1j,
+    ),
+    "one row": (NK.format("0.6 1.5 0.1"), (600, 600), 1.5 + 0.1j),
+}
+
+
+@pytest.mark.parametrize("page", PAGES)
+def test_a_page_is_known_where_its_n_and_k_are(tmp_path, page):
+    text, known, wanted = PAGES[page]
+    found = read_index(write(tmp_path, "a.yml", text))
+    assert found.range == pytest.approx(known)
+    assert complex(found(0.6)) == pytest.approx(complex(wanted), abs=1e-12)
+    assert not found.is_constant
+
+
+def test_a_second_file_of_k_that_changes_is_read_again(tmp_path):
+    path = write(tmp_path, "gold.eta.spd", "400 0.2\n800 0.4\n")
+    for k in (3.0, 4.5):
+        write(tmp_path, "gold.k.spd", f"300 {k}\n900 {k}\n{'1000 1' if k > 4 else ''}")
+        assert complex(read_index(path)(0.6)) == pytest.approx(0.3 + 1j * k)
+
+
 def test_k_of_a_second_file_is_read(tmp_path):
     write(tmp_path, "gold.k.spd", "300 3\n900 3\n")
     assert complex(read_index(write(tmp_path, "gold.eta.spd", "400 0.2\n800 0.4\n"))(0.6)) == pytest.approx(0.3 + 3j)
@@ -112,12 +215,19 @@ def test_k_of_a_second_file_is_read(tmp_path):
         ),
         ("a.spd", "0.4 1.5\n0.8 1.6\n", r"got wavelengths from 0.4 to 0.8 nm: a table in µm\? .spd files have nm"),
         ("a.csv", "wl,n,k\n0.4,1.5,-0.1\n0.8,1.6,0\n", "got k = -0.1, wanted k from 0 to 100"),
-        ("a.csv", "wl,n\n0.4,1.5\n0.3,1.6\n", "wavelengths of n that do not ascend"),
-        ("a.csv", "wl,n\n0.4,nan\n0.8,1.6\n", "not finite"),
-        ("a.csv", N + "\nwl,k\n0.5,0.1\n0.8,0.1\n", "got n from 400 to 800 nm and k from 500 to 800 nm"),
+        ("a.csv", N + N[5:] + N[5:], "neither ascend nor descend"),
+        ("a.csv", "wl,n\n0.4,1.5\n0.4,1.7\n0.8,1.6\n", r"got n = 1\.5 and 1\.7 at 400 nm"),
+        ("a.csv", "wl,n\n0.4,nan\n0.8,1.6\n", "got n = nan, wanted n from 0.01 to 100"),
+        ("a.csv", "wl,n\nnan,1.5\n0.8,1.6\n", "wavelengths of n that are not positive numbers"),
+        ("a.csv", "wl,n\n3,nan\n8,1.6\n", "got n = nan"),
+        ("a.csv", N + "\nwl,k\n0.9,0.1\n1.8,0.1\n", "got n from 400 to 800 nm and k from 900 to 1800 nm"),
         ("a.csv", "wl,n\n0.4,1.5,2\n", "not a table"),
         ("a.csv", "wl,n\n0.4,x\n", "not a table"),
-        ("a.yml", YML.format("formula 7\n    wavelength_range: 0.4 0.8\n    coefficients: 1"), "dispersion formula 7"),
+        (
+            "a.yml",
+            YML.format("formula 10\n    wavelength_range: 0.4 0.8\n    coefficients: 1"),
+            "dispersion formula 10",
+        ),
         ("a.yml", "DATA: [", "not YAML"),
         ("a.spd", "400\n800\n", "one column"),
     ],
@@ -142,7 +252,7 @@ def test_a_file_is_read_again_where_it_has_changed(tmp_path):
 def test_light_outside_of_a_file_is_refused_by_name(tmp_path):
     path = write(tmp_path, "a.csv", N)
     assert refractive_index(0.6, int_ior=str(path), known=True) == pytest.approx(1.55)
-    with pytest.raises(ValueError, match=r"int_ior: got '.+a\.csv' at 900 nm, wanted a wavelength from 400 to 800 nm"):
+    with pytest.raises(ValueError, match=r"int_ior: got light of 900 nm, and a table of 400 to 800 nm \(a\.csv\)"):
         refractive_index(0.9, int_ior=str(path), known=True)
     with pytest.raises(ValueError, match=r"int_ior: got 'glass', wanted a number, a file or one of BK7"):
         refractive_index(0.6, int_ior="glass")
