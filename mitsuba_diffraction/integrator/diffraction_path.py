@@ -22,8 +22,9 @@ Parameters (XML or dictionary):
 {listed(PARAMETERS)}
 
 The picture converges to the picture by `path` with the same parameters. A path tracer finds a small or distant light
-via a grating only by chance, so that the light that gratings cast onto a wall appears as fireflies. Here those paths
-are traced from the light, and all others from the eye.
+via a grating only by chance. Here, where a path from the eye meets a grating, several directions are drawn, and a ray
+is traced along one that is likely to meet a light (`candidates.py`). The light that gratings cast onto a wall, which
+appears as fireflies in `path`, is traced from the light:
 
 With L a light, G a vertex on a surface whose BSDF is or contains a `diffraction_grating` (whichever component of it
 reflects or transmits the light: both sides of `twosided` and of a film, all of a blend, the base), X a vertex on any
@@ -50,8 +51,9 @@ continued by `sample` of the BSDFs, with the correction for shading normals and 
 X is connected to the sensor. There is one path from the light for two samples of the film. As in `path`, a light
 without extent is not seen in a mirror: it is omitted where the grating next to it scatters by a delta component.
 
-Without a grating, with max_depth of 0 to 2, in polarised variants, and for sensors other than `perspective` and
-`thinlens`, this is `path`. Instances and curves count as X. hide_emitters, and films with sample_border, are refused.
+Without a grating, with max_depth of 0 or 1, in polarised variants, and for sensors other than `perspective` and
+`thinlens`, this is `path`. So it is with max_depth of 2 where lights have no extent, or are about as bright in all
+directions. Instances and curves count as X. hide_emitters, and films with sample_border, are refused.
 It can be nested in `aov`. Gradients are computed by `path` (forward) and `prb` (backward), single rays (`sample`) by
 `path`.
 """
@@ -76,7 +78,9 @@ def define() -> type:
             gratings = _lit_gratings(scene, sensor, self.max_depth)
             if gratings is None:
                 return self.path, None
-            eye = eye_class(gratings, self.max_depth, self.rr_depth)
+            eye = eye_class(scene, gratings, self.max_depth, self.rr_depth)
+            if 0 <= self.max_depth < 3:
+                return (eye if eye.candidates.any else self.path), None
             if all(shape in gratings or _is_black(shape.bsdf()) for shape in scene.shapes()):
                 return eye, None
             return eye, LightPaths(scene, sensor, gratings, self.max_depth, self.rr_depth)
@@ -142,7 +146,7 @@ def _lit_gratings(scene: mi.Scene, sensor: mi.Sensor, max_depth: int) -> Grating
     Raises:
         ValueError: if the film takes samples outside its edge (`sample_border`).
     """
-    if 0 <= max_depth < 3 or mi.is_polarized:
+    if 0 <= max_depth < 2 or mi.is_polarized:
         return None
     # Points of the scene can be connected to `perspective` and `thinlens`.
     if not implements(sensor.sample_direction, dr.zeros(mi.SurfaceInteraction3f), mi.Point2f(0.5)):

@@ -14,6 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..bsdf.base import gratings_in, is_grating, parts
+from .candidates import Candidates
 
 
 def quotient(a: mi.Float, b: mi.Float) -> mi.Float:
@@ -115,9 +116,9 @@ def define_eye_paths() -> type:
     class EyePaths(mi.SamplingIntegrator):
         """Mitsuba's `path` without the paths that are traced from the light (see `diffraction_path`)."""
 
-        def __init__(self, gratings: Gratings, max_depth: int, rr_depth: int) -> None:
+        def __init__(self, scene: mi.Scene, gratings: Gratings, max_depth: int, rr_depth: int) -> None:
             mi.SamplingIntegrator.__init__(self, mi.Properties("eye_paths"))
-            self.gratings = gratings
+            self.gratings, self.candidates = gratings, Candidates(scene, gratings.shapes)
             # Opaque, so that all depths run the same kernel.
             self.max_depth = dr.opaque(mi.UInt32, max_depth % 2**32)
             self.rr_depth = dr.opaque(mi.UInt32, rr_depth)
@@ -156,11 +157,18 @@ def define_eye_paths() -> type:
                 point = sampler.next_2d(active)
                 samples_emitter &= from_light ^ True
                 ds, emitted = scene.sample_emitter_direction(si, point, True, samples_emitter)
-                samples_emitter &= ds.pdf != 0
                 wo = si.to_local(ds.d)
-                value, pdf = bsdf.eval_pdf(ctx, si_bsdf, wo, samples_emitter)
-                mis_weight = dr.select(ds.delta, 1, _power_heuristic(ds.pdf, bsdf_probability * pdf))
-                result += dr.select(samples_emitter, throughput * value * emitted * mis_weight, 0)
+                value, pdf = bsdf.eval_pdf(ctx, si_bsdf, wo, samples_emitter & (ds.pdf != 0))
+                slots = self.candidates.slots(si, on_grating & samples_emitter)
+                by_candidates = slots > 0
+                mis_weight = _power_heuristic(ds.pdf, bsdf_probability * pdf)
+                of_candidates = self.candidates.relative_density(slots) * pdf
+                mis_weight = dr.select(by_candidates, quotient(ds.pdf, ds.pdf + of_candidates), mis_weight)
+                mis_weight = dr.select(ds.delta, 1, mis_weight)
+                result += dr.select(samples_emitter & (ds.pdf != 0), throughput * value * emitted * mis_weight, 0)
+                if dr.hint(self.candidates.any, mode="scalar"):
+                    light = self.candidates.sample(scene, sampler, si_bsdf, bsdf, slots, by_candidates)
+                    result += dr.select(by_candidates, throughput * light, 0)
 
                 # BSDF sampling, or the direction to a point on a grating; the next ray may hit an emitter.
                 guided = to_gratings & (sampler.next_1d(active) < _GRATING_PROBABILITY)
@@ -190,7 +198,7 @@ def define_eye_paths() -> type:
                 throughput *= dr.select(to_gratings & (delta ^ True), mixed, weight / bsdf_probability)
                 active &= dr.any(throughput != 0)
                 # Emitters that are never sampled are not found by paths from the light.
-                counts = active & ((from_light & (pdf_emitter > 0)) ^ True)
+                counts = active & ((from_light & (pdf_emitter > 0)) ^ True) & ~(by_candidates & ~delta)
                 mis_weight = _power_heuristic(bsdf_pdf, dr.select(delta, 0, pdf_emitter))
                 result += dr.select(counts, throughput * ds.emitter.eval(next_si, counts) * mis_weight, 0)
 

@@ -1,0 +1,203 @@
+"""Direct light at gratings by candidates, compared with sums over lamps and with long runs of Mitsuba's `path`."""
+
+from functools import partial
+from pathlib import Path
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+import pytest
+from bsdf_support import bitmap, grating, uniform
+
+import mitsuba_diffraction  # noqa: F401 (settles which LLVM is used before a variant is set)
+from mitsuba_diffraction.evaluation.benchmark.noise import load_for_noise
+from mitsuba_diffraction.integrator.unshadowed_light import UnshadowedLight
+from mitsuba_diffraction.render.film import trace_pass
+
+SCENES = Path(__file__).parents[2] / "scenes"
+WAVELENGTHS = (430.0, 500.0, 570.0, 640.0)
+EYE = np.array([0.6, -0.9, 2.0])
+
+
+def at(*position):
+    return mi.ScalarTransform4f().translate(position)
+
+
+def towards(position, target=(0, 0, 0), scale=1.0):
+    return mi.ScalarTransform4f().look_at(position, target, [0.3, 1, 0.2]).scale(scale)
+
+
+def lamp(kind="disk", position=(-1.2, 2.4, 2.0), scale=0.4, radiance=None, **shape):
+    """A lamp that faces the origin."""
+    emitter = {"type": "area", "radiance": radiance or uniform(1.0)}
+    black = {"type": "diffuse", "reflectance": uniform(0.0)}
+    return {"type": kind, "to_world": towards(position, scale=scale), "emitter": emitter, "bsdf": black, **shape}
+
+
+def surface(name="blazed", coherence_length=13.0, **parameters):
+    return grating(name, coherence_length, **{"material": "Al", "conserve_energy": False, **parameters})
+
+
+def profile(**parameters):
+    """A surface whose spectrum is computed for the media around it."""
+    return {"type": "diffraction_grating", "profile": "blazed", "coherence_length": 13.0, **parameters}
+
+
+def scene(bsdf, **lights):
+    return mi.load_dict({"type": "scene", "plate": {"type": "rectangle", "bsdf": bsdf}, **lights})
+
+
+def eye_paths(built, depth=2):
+    """The tracer of paths from the eye; `path` draws no candidates."""
+    integrator = mi.load_dict({"type": "diffraction_path", "max_depth": depth})
+    camera = mi.load_dict({"type": "perspective", "to_world": towards(EYE.tolist())})
+    eye, _ = integrator.parts(built, camera)
+    assert eye.candidates.any
+    return eye
+
+
+def estimates(built, integrator, count=2**16, seed=0, wavelengths=WAVELENGTHS):
+    """The radiance of one ray to the middle of the plate, at fixed wavelengths: mean and standard error, (4,)."""
+    sampler = mi.load_dict({"type": "independent"})
+    sampler.seed(seed, count)
+    ray = mi.Ray3f(mi.Point3f(EYE), -dr.normalize(mi.Vector3f(EYE)))
+    ray.wavelengths = mi.Spectrum(wavelengths)
+    ray.o = ray.o + dr.zeros(mi.Float, count)
+    found = np.array(integrator.sample(built, sampler, mi.RayDifferential3f(ray))[0], np.float64)
+    return found.mean(axis=1), found.std(axis=1, ddof=1) / np.sqrt(count)
+
+
+def sum_over_lamp(built, shape, side=400, wavelengths=WAVELENGTHS):
+    """∫ f cos θ_o L cos θ_l/r² dA over a disk or rectangle that nothing hides, by midpoints; all radiance is one."""
+    ray = mi.Ray3f(mi.Point3f(EYE), -dr.normalize(mi.Vector3f(EYE)))
+    ray.wavelengths = mi.Spectrum(wavelengths)
+    si = built.ray_intersect(ray)
+    u, v = dr.meshgrid(*[(dr.arange(mi.Float, side) + 0.5) / side] * 2)
+    ps = shape.sample_position(0.0, mi.Point2f(u, v))
+    to_lamp = ps.p - si.p
+    square = dr.squared_norm(to_lamp)
+    omega = to_lamp * dr.rsqrt(square)
+    value = si.bsdf().eval(mi.BSDFContext(), si, si.to_local(omega))
+    value *= dr.maximum(-dr.dot(omega, ps.n), 0) / (square * ps.pdf)
+    return np.array(value, np.float64).mean(axis=1)
+
+
+def two_lamps():
+    """Where the orders 1 and −1 of `surface` lead for the ray of `estimates`."""
+    return {"rectangle": lamp("rectangle", (-1.2, 1, 2.2), 0.3), "disk": lamp("disk", (0, 1, 2.3), 0.25)}
+
+
+@pytest.mark.parametrize(
+    "bsdf",
+    [
+        pytest.param(surface, id="bare"),
+        pytest.param(partial(surface, "elaphe", 26.0), id="continuum", marks=pytest.mark.slow),
+        pytest.param(
+            lambda: {"type": "twosided", "bsdf": profile(material="Al", coat_ior=1.5)},
+            id="coat",
+            marks=pytest.mark.slow,
+        ),
+        pytest.param(
+            lambda: {
+                **{"type": "normalmap", "normalmap": bitmap(np.tile([[[0.6, 0.45, 0.98]]], (2, 2, 1)))},
+                "bsdf": grating(
+                    coherence_length=13.0, int_ior=1.6, base={"type": "diffuse", "reflectance": uniform(0.5)}
+                ),
+            },
+            id="normal map and base",
+        ),
+    ],
+)
+def test_light_of_lamps_is_the_sum_over_their_points(bsdf, llvm):
+    built = scene(bsdf(), **two_lamps())
+    lamps = [shape for shape in built.shapes() if shape.is_emitter()]
+    wanted = np.sum([sum_over_lamp(built, shape) for shape in lamps], axis=0)
+    found, error = estimates(built, eye_paths(built), 2**17)
+    assert (error < 0.02 * wanted.max()).all()
+    np.testing.assert_array_less(np.abs(found - wanted), 4 * error + 1e-3 * wanted.max())
+
+
+def spots():
+    """A radiance that is dark but for a corner."""
+    pixels = np.pad([[[5.0, 2.0, 0.5]]], ((0, 7), (0, 7), (0, 0)), constant_values=0.1)
+    return {"type": "bitmap", "bitmap": mi.Bitmap(pixels.astype(np.float32))}
+
+
+def environment(**parameters):
+    pixels = np.full((64, 128, 3), 0.05, np.float32)
+    pixels[20:22, 40:42] = [300.0, 250.0, 100.0]
+    return {"type": "envmap", "bitmap": mi.Bitmap(pixels), **parameters}
+
+
+def many_lamps():
+    rng = np.random.default_rng(4)
+    positions = rng.uniform([-3, -3, 2], [3, 3, 4], (60, 3)).tolist()
+    lamps = {f"lamp{k}": lamp("disk", position, 0.05, uniform(10.0 ** (k % 3))) for k, position in enumerate(positions)}
+    return {**lamps, "sky": {"type": "constant", "radiance": uniform(0.02)}}
+
+
+LIGHTS = {
+    "disk": lambda: {"lamp": lamp()},
+    "rectangle": lambda: {"lamp": lamp("rectangle")},
+    "sphere": lambda: {"lamp": lamp("sphere")},
+    "cube": lambda: {"lamp": lamp("cube")},
+    "cylinder": lambda: {"lamp": lamp("cylinder", p0=[-1, 0, 0], p1=[1, 1, 0], radius=0.3)},
+    "stretched disk": lambda: {
+        "lamp": {**lamp(), "to_world": towards((-1, 2, 2)) @ mi.ScalarTransform4f().scale([0.9, 0.1, 1])}
+    },
+    "texture": lambda: {"lamp": lamp("rectangle", scale=0.8, radiance=spots())},
+    "faint beside bright": lambda: {"lamp": lamp(), "faint": lamp(position=(2, -1, 2), radiance=uniform(1e-4))},
+    "touches": lambda: {"lamp": {**lamp("sphere"), "to_world": at(0.5, 0.5, 0.2).scale(0.25)}},
+    "environment map": lambda: {"sky": environment()},
+    "turned environment map": lambda: {"sky": environment(to_world=mi.ScalarTransform4f().rotate([1, 2, 0.5], 70))},
+    "sun and sky": lambda: {"sky": {"type": "sunsky", "sun_direction": [-0.4, 0.5, 0.7]}},
+    "constant and lamp": lambda: {"sky": {"type": "constant", "radiance": uniform(0.01)}, "lamp": lamp()},
+    "sixty lamps": many_lamps,
+}
+
+
+@pytest.mark.parametrize("name", LIGHTS)
+def test_the_guess_is_nowhere_below_the_radiance(name, llvm):
+    """Along directions to lamps, and in all directions, from points around the origin."""
+    built = scene({"type": "diffuse"}, **LIGHTS[name]())
+    guess = UnshadowedLight(built)
+    rng = mi.PCG32(size=2**15)
+
+    def number():
+        return mi.Float(rng.next_float32())
+
+    point = mi.Point3f(0.8 * number() - 0.4, 0.8 * number() - 0.4, 0.01 + 0.1 * number())
+    si = dr.zeros(mi.SurfaceInteraction3f, 2**15)
+    si.p, si.wavelengths = point, mi.Spectrum(550.0)
+    ds, _ = built.sample_emitter_direction(si, mi.Point2f(number(), number()), False)
+    for omega in (ds.d, mi.warp.square_to_uniform_sphere(mi.Point2f(number(), number()))):
+        ray = mi.Ray3f(point, omega)
+        ray.wavelengths = mi.Spectrum(450.0, 530.0, 590.0, 650.0)
+        found = built.ray_intersect(ray)
+        found.wavelengths = ray.wavelengths
+        radiance = np.array(dr.mean(found.emitter(built).eval(found)))
+        expected = np.array(guess(point, omega, mi.Bool(True)))
+        assert radiance.max() > 0
+        assert (expected > 0).all()
+        # A texture is evaluated on a grid; an environment varies within the neighbours of a cell.
+        assert (expected >= 0.8 * radiance).all(), (expected / radiance).min()
+
+
+def test_sixty_lamps_have_twelve_outlines(llvm):
+    assert int(UnshadowedLight(scene({"type": "diffuse"}, **many_lamps()))._count[0]) == 12
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("depth", [2, 6])
+@pytest.mark.parametrize("name", ["compact_disc", "hologram", "elaphe", "xenopeltis"])
+def test_every_bin_of_a_scene_agrees_with_path(name, depth, llvm):
+    found = {}
+    for integrator in ("path", "diffraction_path"):
+        built = load_for_noise(SCENES / f"{name}.xml", 64, None, type=integrator, max_depth=depth)
+        passes = [trace_pass(built, 64, seed).sum(axis=(0, 1)) for seed in range(16)]
+        bins = np.array([each[:-1] / each[-1] for each in passes])
+        found[integrator] = np.column_stack([bins, bins.mean(axis=1)])
+    means, errors = ([f(found[k]) for k in found] for f in (lambda x: x.mean(0), lambda x: x.std(0, ddof=1) / 4))
+    scores = (means[1] - means[0]) / np.hypot(*errors)
+    assert np.abs(scores).max() < 4
+    assert np.sqrt(np.mean(scores**2)) < 1.6  # bins are not independent of each other
