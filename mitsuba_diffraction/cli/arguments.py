@@ -5,8 +5,8 @@ from __future__ import annotations
 import functools
 import inspect
 import os
-from collections.abc import Callable, Iterable, Sequence
-from contextlib import suppress
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -52,6 +52,16 @@ def _absolute(value: str) -> str:
 Define = Annotated[list[str] | None, typer.Option("-D", metavar="NAME=VALUE", help="set a parameter of the scene")]
 Overwrite = Annotated[bool, typer.Option("--overwrite", help="replace files of other programs, too, but never inputs")]
 Variant = Annotated[str | None, typer.Option(help="Mitsuba variant; default: the fastest spectral one")]
+
+
+@contextmanager
+def named_as_options(names: Mapping[str, str]) -> Iterator[None]:
+    """Name the options of the command line, not the parameters of Python, where a message begins with one of these."""
+    try:
+        yield
+    except RequestError as error:
+        name, colon, rest = str(error).partition(":")
+        raise RequestError(names.get(name, name) + colon + rest) from error.__cause__
 
 
 def check_suffix(option: str, path: Path, *suffixes: str) -> None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import functools
+import inspect
 import math
 from pathlib import Path
 from typing import Annotated
@@ -21,13 +22,15 @@ from ..inverse_design.plate import for_detail, resolved_strokes
 from ..inverse_design.search import WHITE
 from ..inverse_design.target import finest_strokes
 from ..progress import bytes_text, progress_bar, say, show, table, tell
-from .arguments import Overwrite, check_suffix, converted, parse_numbers
+from .arguments import Overwrite, check_suffix, converted, named_as_options, parse_numbers
 from .render import Stopped
 
 _MIN_SAID_TIME = 90.0  # s, that a search takes
 _MIN_SAID_MEMORY = 1e9  # bytes
 _MIN_TEXELS, _MAX_TEXELS = 32, 96  # along the period by default; more take minutes
 _LEGIBLE = 2 / 3  # of the texels of --detail, with which letters can be read
+_OPTIONS = {name: f"--{name.replace('_', '-')}" for name in ("detail", *inspect.signature(search).parameters)}
+_OPTIONS["wavelengths"] = "--wavelength"
 
 
 def design(
@@ -92,17 +95,19 @@ def design(
     if not invert and _is_dark_on_light(picture):
         say("note", f"{target} is light up to its edges; --invert casts what is dark in it, with more contrast")
     wavelengths = None if wavelength is None else parse_numbers("--wavelength", wavelength).tolist()
+    options = _OPTIONS | {"target": str(target)}
     strokes, longest, note = finest_strokes(picture), max(wavelengths or WHITE), ""
     if detail is not None:
         if texels is not None:
             raise RequestError(f"--detail: got {detail:g} and --texels {texels}, wanted one of them")
-        texels, angle = for_detail(detail, texel, angle, longest)
+        with named_as_options(options):
+            texels, angle = for_detail(detail, texel, angle, longest)
         note = f"{texels} texels along the period, angle {angle:g}°, for strokes of 1/{detail:g} of the picture"
     elif texels is None:
         fitting = math.ceil(_LEGIBLE * strokes / resolved_strokes(1, texel, angle, longest))
         texels = min(max(fitting, _MIN_TEXELS), _MAX_TEXELS)
         note = f"{texels} texels along the period; the finest strokes are 1/{strokes:.0f} of the picture"
-    with progress_bar(f"design of {target.name}", "iterations") as progress:
+    with named_as_options(options), progress_bar(f"design of {target.name}", "iterations") as progress:
         found = search(
             picture,
             texel,
@@ -132,7 +137,7 @@ def design(
     )
     for name, file in exports.items():
         tell(f"{file}: {makers.EXPORTS[name][1]}")
-    verdict = Verdict.of(found, strokes)
+    verdict = Verdict.of(found, strokes, inverted=invert)
     for warning in filter(None, [found.warning, "" if verdict.grade == "good" else str(verdict)]):
         tell(f"! {warning}")
     if verdict.grade == "good":

@@ -19,6 +19,7 @@ from .result import Design
 
 _STL_FACE = np.dtype([("normal", "<f4", 3), ("corners", "<f4", (3, 3)), ("attribute", "<u2")])
 _END_OF_GDS = bytes([0, 4, 4, 0])  # the record ENDLIB
+_MAX_LAYER = 2**15 - 1  # a layer is two bytes with a sign
 _BASE = 1.0  # µm, of the solid below the lowest point
 
 
@@ -53,12 +54,9 @@ def save_gds(design: Design, path: str | os.PathLike[str]) -> None:
     """Write the texels of one period as GDSII in µm: texels of level k on layer k, none for level 0.
 
     Raises:
-        ValueError: if the heights are not levels, or gdstk is not installed.
+        ValueError: as `check_gds`.
     """
-    levels = design.plate.levels
-    if levels is None:
-        raise RequestError("--export gds: got continuous heights, wanted levels (--levels)")
-    gdstk = _gdstk()
+    gdstk, levels = check_gds(design.plate.levels)
     library = gdstk.Library(name="RELIEF", unit=1e-6, precision=1e-9)
     cell, texel = library.new_cell("PERIOD"), design.plate.texel
     steps = np.rint(design.texels / design.plate.height_range * (levels - 1)).astype(int)
@@ -75,19 +73,21 @@ def save_gds(design: Design, path: str | os.PathLike[str]) -> None:
             raise OSError(errno.EIO, "only a part could be written; the disk may be full")
 
 
-def check_gds(levels: int | None) -> None:
-    """Raise RequestError if a GDSII file cannot be written, before the search."""
+def check_gds(levels: int | None) -> tuple[Any, int]:
+    """Return gdstk and the number of levels.
+
+    Raises:
+        ValueError: if the heights are not levels, or more than there are layers, or gdstk is not installed.
+    """
     if levels is None:
         raise RequestError("--export gds: got continuous heights, wanted levels (--levels)")
-    _gdstk()
-
-
-def _gdstk() -> Any:
+    if levels > _MAX_LAYER + 1:
+        raise RequestError(f"--export gds: got {levels} levels, wanted at most {_MAX_LAYER + 1}, one for each layer")
     try:
         import gdstk
     except ModuleNotFoundError:
         raise RequestError("--export gds: gdstk is not installed; pip install 'mitsuba_diffraction[gds]'") from None
-    return gdstk
+    return gdstk, levels
 
 
 def save_master(design: Design, path: str | os.PathLike[str]) -> None:

@@ -40,8 +40,8 @@ class Verdict:
     colours: str = ""
 
     @classmethod
-    def of(cls, design: Design, strokes: float | None = None) -> Verdict:
-        """Judge a design; `strokes` is the number of finest strokes of its picture along an edge, for the remedy."""
+    def of(cls, design: Design, strokes: float | None = None, *, inverted: bool = False) -> Verdict:
+        """Judge a design; for the remedy: its picture's finest strokes along an edge, and whether it is a negative."""
         measures = design.light, design.contrast, float(np.mean(design.correlation))
         grade = next(
             (
@@ -57,7 +57,7 @@ class Verdict:
             colours = f"{name} (ΔE00 {difference:.0f})"
             if name == "poor" and grade == "good":
                 grade, remedy = "visible", _NO_PIGMENTS
-        return cls(grade, *measures, "" if grade == "good" else remedy or _remedy(design, strokes), colours)
+        return cls(grade, *measures, "" if grade == "good" else remedy or _remedy(design, strokes, inverted), colours)
 
     def __str__(self) -> str:
         numbers = (
@@ -72,7 +72,7 @@ class Verdict:
         return f"{said}: {numbers}; {self.remedy}"
 
 
-def _remedy(design: Design, strokes: float | None) -> str:
+def _remedy(design: Design, strokes: float | None, inverted: bool) -> str:
     """Return the option that most likely helps, the first cause that is found."""
     plate = design.plate
     wave = _depth(plate)  # µm, of a path difference of one wavelength
@@ -93,7 +93,8 @@ def _remedy(design: Design, strokes: float | None) -> str:
     if plate.tool_blur > plate.texel:
         return f"the tool is too blunt: --tool-blur of at most a texel, {plate.texel:.2g} µm"
     if design.inside.mean() > _MAX_LIT:
-        return "most of the picture is light: --invert casts its dark parts instead"
+        option = "without --invert, its other parts are cast" if inverted else "--invert casts its dark parts instead"
+        return f"most of the picture is light: {option}"
     resolved = resolved_strokes(plate.texels, plate.texel, plate.angle, float(plate.wavelengths.max()))
     if strokes is not None and strokes > resolved:
         return (

@@ -317,6 +317,16 @@ def test_a_plate_that_fails_is_named_with_its_remedy(options, words):
         assert text in str(verdict)
 
 
+def test_of_a_negative_the_option_that_was_given_is_no_remedy():
+    plate = Plate(1.0, 12, 0.6, 17.5, np.array([532.0]), None, None, 0.1)
+    picture = np.ones((8, 8))
+    picture[:2, :2] = 0
+    found = Design.of(0.6 * np.random.default_rng(0).random((12, 12)), plate, wanted_fractions(picture, plate))
+    assert Verdict.of(found).remedy == "most of the picture is light: --invert casts its dark parts instead"
+    remedy = Verdict.of(found, inverted=True).remedy
+    assert remedy == "most of the picture is light: without --invert, its other parts are cast"
+
+
 @pytest.mark.parametrize("options", [{"levels": 4, "height_range": 0.2}, {"levels": 3, "height_range": 0.18}])
 def test_the_remedy_of_few_levels_works(options):
     found = md.design(lopsided(), wavelengths=532, texel=1.0, texels=16, starts=3, **options)

@@ -23,6 +23,9 @@ def folder(tmp_path, monkeypatch):
     picture[2:10, 12:22], picture[10:18, 12:15] = 255, 188  # 188 is half of the light of 255
     Image.fromarray(picture).save("flag.png")
     Image.fromarray(np.zeros_like(picture)).save("black.png")
+    dot = np.zeros((65, 65), np.uint8)
+    dot[31:34, 31:34] = 255
+    Image.fromarray(dot).save("dot.png")
     Image.fromarray(np.dstack([picture] * 4)).save("alpha.png")
     Path("text.png").write_text("no picture")
     Path("cut.png").write_bytes(Path("flag.png").read_bytes()[:60])
@@ -156,18 +159,24 @@ def test_an_interrupted_command_writes_the_best_so_far(command, monkeypatch):
     ("arguments", "message"),
     [
         ("black.png", "black.png: got black alone, wanted light somewhere; --invert casts what is dark"),
-        ("flag.png --seen-on floor", "seen_on: got 'floor', wanted wall or screen"),
+        ("flag.png --seen-on floor", "error: --seen-on: got 'floor', wanted wall or screen"),
         ("text.png", "text.png: not a picture that can be read"),
         ("cut.png", "cut.png: not a picture that can be read"),
         ("gone.png", "gone.png: no such file"),
         ("flag.png -o plate.exr", "-o: got plate.exr, wanted a file name that ends in .gsf or .tif"),
         ("flag.png -o flag.gsf", "-o: would overwrite flag.png, which is read"),
         ("flag.png --wavelength red", "--wavelength: got 'red', wanted a number"),
-        ("flag.png --texel 0.2", "texel: got 0.2 µm, wanted more than half the wavelength"),
+        ("flag.png --texel 0.2", "error: --texel: got 0.2 µm, wanted more than half the wavelength"),
         ("flag.png --detail 8 --texels 12", "--detail: got 8 and --texels 12, wanted one of them"),
         ("flag.png --export obj", "--export: got 'obj', wanted one of stl, gds, master"),
         ("flag.png --export gds", "--export gds: got continuous heights, wanted levels (--levels)"),
-        ("flag.png --levels 1", "levels: got 1, wanted a whole number of at least 2"),
+        ("flag.png --export gds --levels 1000000", "--export gds: got 1000000 levels, wanted at most 32768, one for"),
+        ("flag.png --levels 1", "error: --levels: got 1, wanted a whole number of at least 2"),
+        ("flag.png --wavelength 0.5", "error: --wavelength: got [0.5], wanted one or several in nm"),
+        ("flag.png --height-range 800", "error: --height-range: got 800 µm"),
+        ("flag.png --int-ior glass", "error: --int-ior: got 'glass', wanted"),
+        ("flag.png --detail 1", "error: --detail: got 1.0, wanted the number of finest strokes"),
+        ("dot.png --texels 32", "error: dot.png: it is the mirror direction only"),
     ],
 )
 def test_mistakes_are_refused_in_one_line(command, arguments, message):
