@@ -52,7 +52,8 @@ def made_up(coherence_length=65.0):
         for row, (come, leave) in enumerate(itertools.product(n, n)):
             eta = 1 + np.sin(0.6 * (come + a) + 1) ** 2 + np.sin(1 - 0.6 * (leave + a)) ** 2
             values[start + row] = np.multiply.outer(eta, wavelengths)[:, None] / (80 + 5 * (come - leave))
-    return RigorousSpectrum(axes, values, None, "Al", 0j, coherence_length, 0.01, 0, 0, 0, 1, "made up", "")
+    settings = RigorousSettings(material="Al", coherence_length=coherence_length, tolerance=0.01)
+    return RigorousSpectrum(axes, values, None, settings, 0, 0, 0, 1, "made up", "")
 
 
 @functools.cache

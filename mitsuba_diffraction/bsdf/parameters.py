@@ -14,7 +14,7 @@ import numpy as np
 
 from ..errors import RequestError, is_number
 from ..optics.geometry import SHADOWING
-from ..optics.materials import KnownRange, RefractiveIndex, is_file
+from ..optics.materials import KnownRange, RefractiveIndex, index_of, is_file
 from ..precomputation.recipe import REQUESTED, Recipe, source_named
 from ..precomputation.spectra import Spectrum, load_spectrum
 from ..rigorous.rigorous_spectrum import RigorousSpectrum
@@ -45,6 +45,7 @@ _SCALAR_ONLY = {
     "height_scale": "build the spectrum of the other depth",
     "lateral_scale": "build the spectrum of the other period",
     "base": "transmitted light is not computed; leave it out",
+    "conserve_energy": "they conserve energy by themselves; leave it out",
     "shadowing": "it is part of the efficiencies; leave it out",
     "thin_film_thickness": "its tables are of bare surfaces; leave it out",
     "thin_film_ior": "its tables are of bare surfaces; leave it out",
@@ -229,6 +230,8 @@ def surface_from(props: mi.Properties, media: Media, scale: float = 1.0) -> Spec
             f"surface: got {' and '.join(given) or 'nothing'}, wanted one of filename (a saved spectrum or a recipe), "
             f"profile ({', '.join(PROFILES)}) or, from Python, spectrum"
         )
+    if given == ["spectrum"]:
+        _refuse_requested(props, "a spectrum from Python")
     if given != ["profile"]:
         surface = _handed_over.get(props["spectrum"]) if "spectrum" in given else _from_file(props, media, scale)
         if surface is None:
@@ -249,6 +252,12 @@ def _requested(props: mi.Properties) -> dict[str, Any]:
     if isinstance(terms := given.get("terms"), str) and terms.isdecimal():
         given["terms"] = int(terms)
     return given
+
+
+def _refuse_requested(props: mi.Properties, of: str) -> None:
+    """Check that nothing is requested of a spectrum that is computed already."""
+    for name, value in _requested(props).items():
+        raise RequestError(f"{name}: got {value} with {of}, wanted it when the spectrum is computed")
 
 
 def _inside(props: mi.Properties, media: Media, scale: float, recipe: Recipe) -> Recipe:
@@ -297,8 +306,7 @@ def _from_file(props: mi.Properties, media: Media, scale: float) -> Spectrum | R
     if suffix == ".toml":
         return _inside(props, media, scale, Recipe.load(path, **given))
     if suffix == ".exr":
-        for name, value in given.items():
-            raise RequestError(f"{name}: got {value} with {path}, wanted it when the spectrum is computed")
+        _refuse_requested(props, str(path))
         return load_spectrum(path)
     raise RequestError(
         f"filename: got {path}, wanted a saved spectrum (.exr) or a recipe (.toml); "
@@ -392,18 +400,20 @@ def check_parameters(props: mi.Properties, spectrum: RigorousSpectrum, coat: Coa
         )
     refuse_scalar_only(props)
     medium = 1.0 if coat is None else coat.relative
-    if abs(spectrum.ext_ior - medium) > 1e-3 * medium:
+    if abs(spectrum.settings.ext_ior - medium) > 1e-3 * medium:
         raise RequestError(
             f"coat_ior: got {'none' if coat is None else f'{coat.index:g}'}, but the rigorous spectrum is of a grating "
-            f"below a medium of index {spectrum.ext_ior:g}: build it with ext_ior={medium:.4g}"
+            f"below a medium of index {spectrum.settings.ext_ior:g}: build it with ext_ior={medium:.4g}"
         )
     # With a coat, `ext_ior` is the index above the coat.
     if any(name in props for name in ("material", "int_ior", *(["ext_ior"] if coat is None else []))):
         wanted = settings_from(props, coat)
-        if "material" in wanted:
-            same = wanted["material"] == spectrum.material
+        if is_file(material := wanted.get("material", "")):
+            same = index_of("material", material).digest == spectrum.material_digest
+        elif material:
+            same = material == spectrum.settings.material
         else:
-            same = not spectrum.material and abs(wanted["int_ior"] - spectrum.int_ior) < 1e-3 * abs(spectrum.int_ior)
+            same = abs(wanted["int_ior"] - spectrum.int_ior) < 1e-3 * abs(spectrum.int_ior)
         if not same:
             got = " ".join(f"{name} {value}" for name, value in wanted.items())
             raise RequestError(

@@ -185,7 +185,8 @@ class Recipe:
                 raise RequestError("wanted the tables [surface] and [spectrum]")
             # Files of indices are named relative to the recipe.
             of_files = {name for name in ("material", "int_ior") if is_file(spectrum.get(name))}
-            spectrum = {**spectrum, **{name: str(path.parent / spectrum[name]) for name in of_files}, **settings}
+            folder = path.parent.absolute()
+            spectrum = {**spectrum, **{name: str(folder / spectrum[name]) for name in of_files}, **settings}
             _refuse_unknown("[spectrum]", spectrum, _SPECTRUM_KEYS)
             _refuse_other_values(spectrum)
             return cls(surface, Settings.of(**spectrum), path.parent)
@@ -284,7 +285,10 @@ class Recipe:
             refuse_special(scan)
             content.update(scan.read_bytes())
             content.update(scan.suffix.lower().encode())
-        request = surface, self.patches, self.settings.chosen
+        settings = self.settings.chosen
+        if is_file(material := settings.get("material")):
+            settings["material"] = Path(str(material)).name
+        request = surface, self.patches, settings
         content.update(json.dumps(request, sort_keys=True, default=str).encode())
         return content.hexdigest()
 

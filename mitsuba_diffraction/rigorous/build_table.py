@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import dataclasses
 import functools
 import hashlib
 import itertools
@@ -11,6 +10,7 @@ import warnings
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import suppress
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 from zipfile import BadZipFile
@@ -113,6 +113,8 @@ def build_rigorous(
         UserWarning: if `error` of the finest table exceeds the tolerance, or `polarisation_error` three times that.
     """
     tolerance = 1e-2 if settings.tolerance is None else settings.tolerance
+    material = settings.material
+    stored = replace(settings, tolerance=float(tolerance), material=material and Path(material).name)
     period = height_field.tile_size[0]
     max_period = MAX_PERIOD_IN_WAVELENGTHS * settings.wavelengths[0] * 1e-3
     if period > max_period:
@@ -133,17 +135,14 @@ def build_rigorous(
                 axes=build.axes,
                 values=values,
                 mueller=mueller,
-                material=settings.material or "",
-                int_ior=complex(settings.int_ior or 0),
-                ext_ior=float(settings.ext_ior),
-                coherence_length=float(settings.coherence_length),
-                tolerance=float(tolerance),
+                settings=stored,
+                material_digest=index_of("material", material).digest if material else "",
                 harmonics=surface.harmonics,
                 source=height_field.source,
                 source_digest=height_field.digest,
                 **dict.fromkeys(("error", "max_error", "max_error_near"), np.nan),
             )
-            spectrum = dataclasses.replace(spectrum, **_errors(spectrum, checks))
+            spectrum = replace(spectrum, **_errors(spectrum, checks))
             # `polarisation_error` is NaN without matrices.
             if spectrum.error <= tolerance and not spectrum.polarisation_error > MAX_POLARISATION_ERROR * tolerance:
                 return spectrum

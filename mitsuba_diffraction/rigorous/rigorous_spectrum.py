@@ -13,13 +13,13 @@ import os
 from dataclasses import dataclass, field
 from functools import cached_property
 from pathlib import Path
-from typing import Any
+from typing import Any, cast
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from ..errors import RequestError
-from ..settings import TRANSMISSIONS, lobe_cutoff, lobe_width
+from ..settings import RigorousSettings, lobe_cutoff, lobe_width
 from ..spectrum.exr import doubles, one_line, read_channels, write_channels
 from ..spectrum.grids import OrderGrid
 from .solver import ODD, REVERSED
@@ -27,19 +27,17 @@ from .solver import ODD, REVERSED
 Real = NDArray[np.float64]
 
 RIGOROUS_FORMAT = "mitsuba_diffraction rigorous spectrum"
-RIGOROUS_FORMAT_VERSION = 5
+RIGOROUS_FORMAT_VERSION = 6
 
-# Attributes and their names in files.
+# Settings and attributes, and their names in files.
+_SETTINGS = {"ext_ior": "extIor", "coherence_length": "coherenceLength", "tolerance": "tolerance"}
 _NUMBERS = {
-    "ext_ior": "extIor",
-    "coherence_length": "coherenceLength",
-    "tolerance": "tolerance",
     "error": "error",
     "max_error": "worst",
     "max_error_near": "worstNear",
     "polarisation_error": "polarisationError",
 }
-_TEXTS = {"material": "material", "source": "source", "source_digest": "sourceDigest"}
+_TEXTS = {"material_digest": "materialDigest", "source": "source", "source_digest": "sourceDigest"}
 _STEPS = ("stepsF", "stepsX", "stepsZ")
 
 
@@ -261,10 +259,9 @@ class RigorousSpectrum:
         values: η at the nodes, (rows, F, X, Z).
         mueller: M_ij at the nodes, (rows, F, X, Z, 4, 4), or None. Elements that are odd in k_y are divided by k_y/ν,
             so that all are smooth at k_y = 0.
-        material: a conductor by Mitsuba's name, or "" for a dielectric.
-        int_ior: n + ik if there is no material.
-        coherence_length: L_c in µm; it sets the width σ_q of each order.
-        tolerance: the requested bound of `error`.
+        settings: the parameters it was built with. The tolerance is a number, and a file that is the material is named
+            without its folder.
+        material_digest: SHA-256 of the index of the material; empty for an index that is a number.
         error: the mean of Σ|Δη_m| / Σ η_m, measured at directions (uniform over the hemisphere) and wavelengths that
             were not used to build the table. Sums are over all outgoing orders, above and below; with transmission,
             light is incident from above and from below.
@@ -273,39 +270,52 @@ class RigorousSpectrum:
         harmonics: N of the solver.
         source: origin of the heights.
         source_digest: SHA-256 of the height field.
-        ext_ior: index of the medium above relative to air; wavelengths are measured in this medium.
         polarisation_error: the mean of Σ_m max_ij |ΔM_ij| / Σ η_m, measured as `error`; NaN without matrices.
     """
 
     axes: Axes
     values: NDArray[np.float32]
     mueller: NDArray[np.float32] | None
-    material: str
-    int_ior: complex
-    coherence_length: float
-    tolerance: float
+    settings: RigorousSettings
     error: float
     max_error: float
     max_error_near: float
     harmonics: int
     source: str
     source_digest: str = field(repr=False)
-    ext_ior: float = 1.0
+    material_digest: str = field(default="", repr=False)
     polarisation_error: float = float("nan")
 
     def __post_init__(self) -> None:
-        if self.transmission not in TRANSMISSIONS:
-            raise RequestError(f"transmission: got {self.transmission!r}, wanted one of {', '.join(TRANSMISSIONS)}")
+        same = np.allclose(self.axes.wavelengths, np.multiply(self.settings.wavelengths, 1e-3), rtol=1e-9)
+        if not (same and self.axes.transmission == self.settings.transmission):
+            raise RequestError(f"axes: got {self.axes}, wanted the wavelengths and the transmission of {self.settings}")
+        if self.settings.polarised != (self.mueller is not None):
+            raise RequestError(f"mueller: got {self.mueller}, wanted it with polarised=True and without it with False")
         for name, wanted in (("values", self.axes.shape), ("mueller", (*self.axes.shape, 4, 4))):
             table = getattr(self, name)
             if table is not None and (table.shape != wanted or table.dtype != np.float32):
                 raise RequestError(f"{name}: got {table.shape} of {table.dtype}, wanted {wanted} of float32")
-        lobe_width(self.coherence_length)
 
     @property
     def transmission(self) -> str:
         """One of `TRANSMISSIONS`."""
-        return self.axes.transmission
+        return self.settings.transmission
+
+    @property
+    def int_ior(self) -> complex:
+        """n + ik below, relative to the medium above; 0 if there is a material."""
+        return complex(cast(complex, self.settings.int_ior or 0))
+
+    @property
+    def coherence_length(self) -> float:
+        """L_c in µm, which sets the width σ_q of each order."""
+        return self.settings.coherence_length
+
+    @property
+    def tolerance(self) -> float:
+        """The requested bound of `error`."""
+        return cast(float, self.settings.tolerance)
 
     @property
     def indices(self) -> tuple[float, float]:
@@ -336,9 +346,8 @@ class RigorousSpectrum:
 
     @property
     def wavelengths(self) -> tuple[float, float]:
-        """(shortest, longest) in nm."""
-        shortest, longest = (1e3 * w for w in self.axes.wavelengths)
-        return shortest, longest
+        """(shortest, longest) in nm, in the medium above."""
+        return self.settings.wavelengths
 
     @property
     def grid(self) -> OrderGrid:
@@ -348,9 +357,10 @@ class RigorousSpectrum:
     @property
     def material_name(self) -> str:
         """The material as recipes and scenes specify it."""
-        medium = "" if self.ext_ior == 1 else f" below ext_ior {self.ext_ior:.6g}"
-        if self.material:
-            return f"material {self.material}{medium}"
+        above = self.settings.ext_ior
+        medium = "" if above == 1 else f" below ext_ior {above:.6g}"
+        if self.settings.material:
+            return f"material {self.settings.material}{medium}"
         index = self.int_ior.real if np.imag(self.int_ior) == 0 else self.int_ior
         return f"int_ior {index:.6g}{medium}"
 
@@ -372,9 +382,8 @@ class RigorousSpectrum:
     @cached_property
     def digest(self) -> str:
         """SHA-256 of everything that a renderer needs: spectra of equal digest render alike."""
-        description = repr(
-            (self.axes, self.material, self.int_ior, self.coherence_length, self.tolerance, self.ext_ior)
-        )
+        of = self.settings
+        description = repr((self.axes, of.material, self.int_ior, of.coherence_length, of.tolerance, of.ext_ior))
         arrays = [a for a in (self.values, self.mueller) if a is not None]
         return hashlib.sha256(description.encode() + b"".join(a.tobytes() for a in arrays)).hexdigest()
 
@@ -457,23 +466,24 @@ class RigorousSpectrum:
     def save(self, path: str | os.PathLike[str], recipe: str = "") -> None:
         """Write the spectrum as an OpenEXR file; argument and errors of `GratingSpectrum.save`."""
         axes = self.axes
-        index = complex(self.int_ior)
         arrays = {"eta": self.values.reshape(axes.rows, -1)}
         if self.mueller is not None:
             matrices = self.mueller.reshape(axes.rows, -1, 4, 4)
             arrays |= {_channel(i, j): np.ascontiguousarray(matrices[..., i, j]) for i, j in np.ndindex(4, 4)}
         header = {
             "period": doubles(axes.period),
-            "wavelengths": doubles(*axes.wavelengths),
+            "wavelengths": doubles(*self.wavelengths),
             **dict(zip(_STEPS, axes.steps, strict=True)),
             "index": doubles(axes.index),
             "harmonics": self.harmonics,
             "polarised": int(self.mueller is not None),
-            "intIor": doubles(index.real, index.imag),
+            "material": self.settings.material or "",
+            "intIor": doubles(self.int_ior.real, self.int_ior.imag),
+            **{key: doubles(getattr(self.settings, name)) for name, key in _SETTINGS.items()},
             **{key: doubles(getattr(self, name)) for name, key in _NUMBERS.items()},
             "transmission": self.transmission,
             **{key: getattr(self, name) for name, key in _TEXTS.items()},
-            "units": "lengths and wavelengths in micrometres",
+            "units": "lengths in micrometres, wavelengths in nanometres",
         }
         write_channels(path, RIGOROUS_FORMAT, RIGOROUS_FORMAT_VERSION, header, arrays, recipe)
 
@@ -485,16 +495,26 @@ class RigorousSpectrum:
         try:
             (period,), (shortest, longest), (index,) = header["period"], header["wavelengths"], header["index"]
             steps = tuple(header[name] for name in _STEPS)
-            axes = Axes(float(period), (float(shortest), float(longest)), steps, float(index), header["transmission"])
+            index_below = complex(*(float(x) for x in header["intIor"]))
+            settings = RigorousSettings(
+                wavelengths=(float(shortest), float(longest)),
+                material=header["material"] or None,
+                int_ior=None if header["material"] else index_below,
+                polarised=bool(header["polarised"]),
+                transmission=header["transmission"],
+                **{name: header[key].item() for name, key in _SETTINGS.items()},
+            )
+            in_um = 1e-3 * settings.wavelengths[0], 1e-3 * settings.wavelengths[1]
+            axes = Axes(float(period), in_um, steps, float(index), settings.transmission)
             mueller = None
-            if header["polarised"]:
+            if settings.polarised:
                 found = [channels[_channel(i, j)].pixels for i, j in np.ndindex(4, 4)]
                 mueller = np.stack(found, axis=-1).reshape(*axes.shape, 4, 4)
             return cls(
                 axes=axes,
                 values=np.ascontiguousarray(channels["eta"].pixels.reshape(axes.shape)),
                 mueller=mueller,
-                int_ior=complex(*(float(x) for x in header["intIor"])),
+                settings=settings,
                 harmonics=header["harmonics"],
                 **{name: header[key].item() for name, key in _NUMBERS.items()},
                 **{name: header[key] for name, key in _TEXTS.items()},

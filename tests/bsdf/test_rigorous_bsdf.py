@@ -12,8 +12,10 @@ from bsdf_support import check_chi_square, direction, evaluate, interaction, mad
 import mitsuba_diffraction as md
 from mitsuba_diffraction.bsdf import testing
 from mitsuba_diffraction.optics.geometry import fresnel, horizon_gain
+from mitsuba_diffraction.optics.materials import index_of
 from mitsuba_diffraction.rigorous.rigorous_spectrum import RigorousSpectrum
 from mitsuba_diffraction.rigorous.solver import mueller
+from mitsuba_diffraction.settings import RigorousSettings
 
 SURFACE = {"profile": "blazed", "period": 0.3, "depth": 0.05, "samples": 64}
 SETTINGS = {"theory": "rigorous", "int_ior": 1.5, "wavelengths": [400.0, 500.0], "tolerance": 0.02, "polarised": True}
@@ -128,7 +130,7 @@ def test_samples_have_even_weights_that_average_to_the_efficiencies(llvm, spectr
 @pytest.mark.few(2)
 @pytest.mark.parametrize("theta", [0, 40, 75])
 def test_samples_pass_the_chi_square_test(llvm, solved, theta):
-    wide = dataclasses.replace(solved, coherence_length=3.0)
+    wide = dataclasses.replace(solved, settings=dataclasses.replace(solved.settings, coherence_length=3.0))
     check_chi_square(plugin(wide, orientation=20.0), direction(theta, 20), WAVELENGTHS)
     check_chi_square(plugin(made_up(3.0), orientation=20.0), direction(theta, 20))
 
@@ -137,7 +139,7 @@ def test_samples_pass_the_chi_square_test(llvm, solved, theta):
 @pytest.mark.parametrize("theta", [40, 0, 75])
 def test_polarised_samples_pass_the_chi_square_test(solved, theta):
     use("llvm_ad_spectral_polarized")
-    wide = dataclasses.replace(solved, coherence_length=3.0)
+    wide = dataclasses.replace(solved, settings=dataclasses.replace(solved.settings, coherence_length=3.0))
     check_chi_square(plugin(wide, orientation=20.0), direction(theta, 20), WAVELENGTHS)
 
 
@@ -181,6 +183,9 @@ def test_files_recipes_and_profiles_have_equal_values(llvm, solved, recipe_file,
     [
         ({"height_scale": 0.5}, "height_scale: got 0.5, wanted none with theory=rigorous: build the spectrum"),
         ({"shadowing": "none"}, "shadowing: got 'none', wanted none with theory=rigorous"),
+        ({"conserve_energy": False}, "conserve_energy: got False, wanted none with theory=rigorous"),
+        ({"tolerance": 0.1}, "tolerance: got 0.1 with a spectrum from Python, wanted it when the spectrum is computed"),
+        ({"representation": "taylor"}, "representation: got taylor with a spectrum from Python"),
         ({"base": {"type": "diffuse"}}, "base: got a BSDF, wanted none with theory=rigorous"),
         ({"material": "Al"}, "got material Al, but the rigorous spectrum is of int_ior 1.5"),
         ({"int_ior": 1.6}, "got int_ior 1.59956, but the rigorous spectrum is of int_ior 1.5"),
@@ -192,6 +197,23 @@ def test_files_recipes_and_profiles_have_equal_values(llvm, solved, recipe_file,
 def test_parameters_of_scalar_theory_are_refused(llvm, solved, parameters, text):
     with pytest.raises(RuntimeError, match=text):
         plugin(solved, **parameters)
+
+
+def test_a_table_is_of_the_index_in_a_file_wherever_that_lies(llvm, tmp_path):
+    (tmp_path / "first").mkdir()
+    table = tmp_path / "first" / "metal.spd"
+    table.write_text("300 0.5 3\n900 0.6 4\n")
+    settings = RigorousSettings(material="metal.spd", tolerance=0.01)
+    spectrum = dataclasses.replace(
+        made_up(), settings=settings, material_digest=index_of("material", str(table)).digest
+    )
+    spectrum.save(tmp_path / "first" / "table.exr")
+    moved = (tmp_path / "first").rename(tmp_path / "second")
+    scene = {"type": "diffraction_grating", "filename": str(moved / "table.exr"), "material": str(moved / "metal.spd")}
+    assert "material metal.spd" in str(mi.load_dict(scene))
+    (moved / "metal.spd").write_text("300 0.5 3\n900 0.6 5\n")
+    with pytest.raises(RuntimeError, match=r"material: got material .*metal.spd, but the rigorous spectrum is of"):
+        mi.load_dict(scene)
 
 
 def test_surfaces_of_several_rows_are_refused(llvm):
@@ -314,7 +336,8 @@ def test_a_table_of_unpolarised_light_is_refused_in_polarised_variants():
 
 def under_coat(spectrum, **parameters):
     """Return a grating under a coat of index 1.5, with the table as if built for it: wavelengths outside are longer."""
-    return plugin(dataclasses.replace(spectrum, ext_ior=1.5), **{"coat_ior": 1.5, "ext_ior": 1.0, **parameters})
+    spectrum = dataclasses.replace(spectrum, settings=dataclasses.replace(spectrum.settings, ext_ior=1.5))
+    return plugin(spectrum, **{"coat_ior": 1.5, "ext_ior": 1.0, **parameters})
 
 
 def albedo_under_coat(spectrum, theta, phi, wavelength, efficiencies):

@@ -19,6 +19,7 @@ from scipy.special import erf
 
 import mitsuba_diffraction as md
 from mitsuba_diffraction.rigorous.rigorous_spectrum import Axes, RigorousSpectrum
+from mitsuba_diffraction.settings import RigorousSettings
 
 PERIOD, ETA, WAVELENGTH = 0.3, 1.5, 0.45
 WAVELENGTHS = (405.0, 440.0, 470.0, 498.0)
@@ -287,7 +288,8 @@ def test_orders_with_a_rayleigh_anomaly_in_a_bin_are_drawn(side):
     """All orders have equal efficiencies, so that an order missing in a bin would have a large weight."""
     axes = Axes(1.7, (0.36, 0.83), (1, 1, 1), ETA, "interface")
     values = np.full(axes.shape, 0.01, np.float32)
-    alike = RigorousSpectrum(axes, values, None, "", ETA + 0j, 65.0, 0.01, 0, 0, 0, 1, "made up", "")
+    settings = RigorousSettings(int_ior=ETA, tolerance=0.01, transmission="interface")
+    alike = RigorousSpectrum(axes, values, None, settings, 0, 0, 0, 1, "made up", "")
     rng, count = np.random.default_rng(2), 1 << 16
     wi = random_directions(rng, count, 0.2) * [1, 1, side]
     u = rng.random((3, count)).astype(np.float32)

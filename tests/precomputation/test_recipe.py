@@ -397,6 +397,20 @@ def test_another_parameter_is_another_spectrum(own_cache, builds, surface, spect
         assert getattr(got, name) == getattr(wanted, name)
 
 
+def test_a_recipe_with_the_file_of_an_index_is_the_same_by_every_path(tmp_path, monkeypatch):
+    folder = tmp_path / "folder"
+    folder.mkdir()
+    (folder / "glass.spd").write_text("300 1.5\n900 1.6\n")
+    write(folder, BLAZE + '[spectrum]\ntheory = "rigorous"\nmaterial = "glass.spd"\n')
+    monkeypatch.chdir(folder)
+    recipes = [Recipe.load(p) for p in ("recipe.toml", "../folder/recipe.toml", folder / "recipe.toml")]
+    monkeypatch.chdir(tmp_path)
+    digests = {recipe.digest() for recipe in recipes}
+    assert len(digests) == 1
+    (folder / "glass.spd").write_text("300 1.5\n900 1.7\n")
+    assert recipes[0].digest() not in digests
+
+
 @pytest.mark.slow
 def test_the_cache_identifies_a_scan_by_its_bytes(tmp_path, own_cache, builds):
     text = '[surface]\nscan = "scan.npy"\npixel_size = 0.05\n[spectrum]\ntolerance = 0.01\n'

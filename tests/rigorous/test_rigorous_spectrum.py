@@ -1,6 +1,7 @@
 """The table of rigorous efficiencies against the solver."""
 
 import warnings
+from copy import copy
 from dataclasses import replace
 
 import numpy as np
@@ -10,6 +11,7 @@ from hypothesis import strategies as st
 
 import mitsuba_diffraction as md
 from mitsuba_diffraction import gratings, rigorous
+from mitsuba_diffraction.errors import RequestError
 from mitsuba_diffraction.optics.geometry import fresnel
 from mitsuba_diffraction.rigorous import build_table
 from mitsuba_diffraction.rigorous.build_table import build_rigorous
@@ -110,8 +112,23 @@ def test_a_spectrum_is_unchanged_by_saving_and_loading(spectrum, tmp_path):
     spectrum.save(tmp_path / "table.exr")
     loaded = RigorousSpectrum.load(tmp_path / "table.exr")
     np.testing.assert_array_equal(loaded.values, spectrum.values)
-    for name in ("axes", "material", "int_ior", "coherence_length", "error", "harmonics", "source", "source_digest"):
+    for name in ("axes", "settings", "error", "harmonics", "source", "source_digest", "digest"):
         assert getattr(loaded, name) == getattr(spectrum, name)
+
+
+@pytest.mark.parametrize(
+    ("name", "value"),
+    [("coherence_length", -1.0), ("tolerance", 7.0), ("ext_ior", 0.5), ("int_ior", 1.5 + 1j), ("transmission", "all")],
+)
+def test_settings_in_a_file_are_checked(spectrum, tmp_path, name, value):
+    altered = copy(replace(spectrum.settings, transmission="interface" if name == "int_ior" else "none"))
+    object.__setattr__(altered, name, value)
+    wrong = copy(spectrum)
+    object.__setattr__(wrong, "settings", altered)
+    wrong.save(tmp_path / "table.exr")
+    wanted = "transmission" if name == "int_ior" else name
+    with pytest.raises(RequestError, match=rf"table.exr: a damaged spectrum \({wanted}: got "):
+        RigorousSpectrum.load(tmp_path / "table.exr")
 
 
 @pytest.fixture(scope="module", params=["interface", pytest.param("sheet", marks=pytest.mark.slow)])
