@@ -7,10 +7,10 @@ import math
 import os
 from collections.abc import Callable
 from dataclasses import dataclass, fields
+from statistics import NormalDist
 from typing import Any, ClassVar, cast
 
 import numpy as np
-import scipy.special
 from numpy.typing import ArrayLike, NDArray
 
 from .errors import RequestError, check_whole, is_number
@@ -297,7 +297,7 @@ def lobe_cutoff(change: float) -> float:
     changes the Gaussian by twice this fraction in the L1 norm. ρ is chosen so that this equals `change`.
     """
     # 1 − √(1 − change/2) without cancellation.
-    return float(-scipy.special.ndtri(-np.expm1(0.5 * np.log1p(-change / 2)) / 2))
+    return -NormalDist().inv_cdf(-math.expm1(0.5 * math.log1p(-change / 2)) / 2)
 
 
 def matching(q: ArrayLike, kappa: ArrayLike) -> tuple[NDArray[np.float64], NDArray[np.float64]]:

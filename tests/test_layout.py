@@ -66,6 +66,16 @@ def _imports(module):
                     yield found
 
 
+def imports_by_name(module):
+    """The modules of the package whose dotted names stand in a string, as for importlib.import_module."""
+    words = [
+        node.value.strip(".").removeprefix("mitsuba_diffraction.")
+        for node in ast.walk(ast.parse(MODULES[module].read_text(encoding="utf-8")))
+        if isinstance(node, ast.Constant) and isinstance(node.value, str)
+    ]
+    return {word for word in words if "." in word and f"mitsuba_diffraction.{word}" in MODULES}
+
+
 FIXED = {"CHECKS", "MANUAL", "PARAMETERS", "define", "efficiencies", "main"}
 """Names that several modules have: of checks and of plugins, by which they are found; `md.efficiencies` and
 `md.rigorous.efficiencies`; the entry points of the process and of the command line."""
@@ -190,6 +200,22 @@ def test_nothing_depends_on_what_judges_the_product():
             assert not any(found.startswith(judges) for found in imports(module)), module
 
 
+@pytest.mark.quick
+def test_only_the_doors_import_by_name():
+    """Registration makes a plugin when a scene first has one, and the command line knows what judges the product."""
+    found = {module.partition(".")[2]: names for module in MODULES if (names := imports_by_name(module))}
+    home = found.pop("")
+    assert not any(name.startswith("evaluation") for name in home)
+    assert found == {
+        "registration.plugins": {
+            "bsdf.diffraction_grating",
+            "evaluation.realtime_shader.diffraction_shader",
+            "integrator.diffraction_path",
+        },
+        "cli": {"evaluation.commands"},
+    }
+
+
 def test_only_the_command_depends_on_the_viewer():
     viewer = "mitsuba_diffraction.viewer"
     for module in MODULES:
@@ -243,6 +269,36 @@ def test_plugins_are_registered_whenever_the_package_is_imported(lines):
     blaze = "{'type': 'diffraction_grating', 'profile': 'blazed', 'depth': 0.05, 'conserve_energy': False}"
     printed = in_a_fresh_process("\n".join([*lines, f"print(type(mitsuba.load_dict({blaze})).__name__)"]))
     assert printed == ["DiffractionGrating"]
+
+
+def test_a_recipe_is_read_without_scipys_interpolation():
+    """Which takes longer to import than most other modules together, and few surfaces need it."""
+    program = "import sys\nimport mitsuba_diffraction.precomputation.recipe\nprint('scipy.interpolate' in sys.modules)"
+    assert in_a_fresh_process(program) == ["False"]
+
+
+def test_a_variant_is_set_without_the_modules_of_the_plugins():
+    """They are imported when a scene first has a plugin, whose class is made once."""
+    printed = in_a_fresh_process(
+        """
+import sys
+import mitsuba_diffraction, mitsuba as mi
+
+def ours():
+    return [name for name in sys.modules if name.startswith("mitsuba_diffraction")]
+
+mi.set_variant("llvm_ad_spectral")
+mi.load_dict({"type": "scene", "ball": {"type": "sphere"}})
+print(len(ours()), "scipy" in sys.modules)
+path = {"type": "diffraction_path"}
+first = type(mi.load_dict(path))
+mi.set_variant("scalar_rgb")
+mi.set_variant("llvm_ad_spectral")
+print(type(mi.load_dict(path)) is first, any("evaluation" in name for name in ours()))
+"""
+    )
+    assert int(printed[0]) <= 8
+    assert printed[1:] == ["False", "True", "False"]
 
 
 REPOSITORY = PACKAGE.parent

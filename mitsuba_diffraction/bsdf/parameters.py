@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import weakref
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -15,6 +14,7 @@ import numpy as np
 from ..errors import RequestError, is_number
 from ..optics.geometry import SHADOWING
 from ..optics.materials import KnownRange, RefractiveIndex, index_of, is_file
+from ..plugin_parameters import handed_over
 from ..precomputation.recipe import REQUESTED, Recipe, source_named
 from ..precomputation.spectra import Spectrum, load_spectrum
 from ..rigorous.rigorous_spectrum import RigorousSpectrum
@@ -36,11 +36,9 @@ from .indices import index_from
 from .thin_film import with_film
 from .varying import VaryingNumber, check_texture, numbers_from
 
-_PREFIX = "handed over: "
 _MAX_DEGREES = 1e6
 _MIN_HEIGHT_SCALE = 1e-6  # stands for 0, where κ₁, which bounds K of transmitted light, would vanish
 _MIN_LATERAL_SCALE = 0.01  # below, a period is shorter than any wavelength
-_handed_over: weakref.WeakValueDictionary[str, Spectrum] = weakref.WeakValueDictionary()
 _SCALAR_ONLY = {
     "height_scale": "build the spectrum of the other depth",
     "lateral_scale": "build the spectrum of the other period",
@@ -233,8 +231,8 @@ def surface_from(props: mi.Properties, media: Media, scale: float = 1.0) -> Spec
     if given == ["spectrum"]:
         _refuse_requested(props, "a spectrum from Python")
     if given != ["profile"]:
-        surface = _handed_over.get(props["spectrum"]) if "spectrum" in given else _from_file(props, media, scale)
-        if surface is None:
+        surface = handed_over.get(props["spectrum"]) if "spectrum" in given else _from_file(props, media, scale)
+        if not isinstance(surface, Spectrum | Recipe):
             raise RequestError(
                 f"spectrum: got {props['spectrum']!r}, wanted a spectrum in Python's load_dict; XML takes a filename"
             )
@@ -312,20 +310,6 @@ def _from_file(props: mi.Properties, media: Media, scale: float) -> Spectrum | R
         f"filename: got {path}, wanted a saved spectrum (.exr) or a recipe (.toml); "
         "a scan is turned into a spectrum by `mitsuba-diffraction precompute`, or named by a recipe"
     )
-
-
-def hand_over(value: object) -> object:
-    """Return a scene dictionary in which each spectrum is replaced by a handle.
-
-    mi.load_dict accepts only types bound in C++, therefore spectra are passed by name.
-    """
-    if isinstance(value, Spectrum):
-        handle = f"{_PREFIX}{id(value)}"
-        _handed_over[handle] = value
-        return handle
-    if isinstance(value, dict):
-        return {key: hand_over(item) for key, item in value.items()}
-    return value
 
 
 def settings_from(props: mi.Properties, coat: Coat | None) -> dict[str, Any]:

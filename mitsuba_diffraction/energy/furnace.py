@@ -36,7 +36,6 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.polynomial.legendre import leggauss
 from numpy.typing import ArrayLike, NDArray
-from scipy.interpolate import CubicSpline
 
 from ..optics.film_stack import Plane, Stack
 from ..optics.geometry import AnyArray, fresnel, horizon_gain, k_g
@@ -479,6 +478,8 @@ def _binned(spectrum: PowerSpectrum, kappas: Real, width_factor: float) -> tuple
     Returns:
         Centres of power (n, 2), standard deviations (n,), both in cycles/µm, and powers (n, K).
     """
+    from scipy.interpolate import CubicSpline
+
     sigma, grid, q = spectrum.lobe_width, spectrum.grid, _nodes(spectrum)
     # The standard deviation of one node.
     own = sigma if isinstance(grid, OrderGrid) else max(grid.spacing) / 2

@@ -1,5 +1,7 @@
 """Registration of the plugins with Mitsuba, for every variant, now and after each mi.set_variant.
 
+The class of a plugin is made when a scene first has one, as the modules that it needs take seconds to import.
+
 Mitsuba 3.10 and later discover this module through the entry point group `mitsuba` and reload it on each change of
 variant; importing `mitsuba_diffraction` has the same effect in all versions.
 """
@@ -13,7 +15,7 @@ import drjit as dr
 import mitsuba as mi
 
 from ..variants import is_supported, llvm_problem
-from .wrapped_functions import wrap_functions
+from .wrapped_functions import classes, making, wrap_functions
 
 # Name, registration function of Mitsuba, and the module whose `define` makes the class for the current variant.
 PLUGINS = (
@@ -26,7 +28,6 @@ PLUGINS = (
 def register_plugins(variant: str) -> None:
     """Register the plugins for `variant`, or stand-ins that raise the reason why they cannot work."""
     for name, function, module in PLUGINS:
-        define = importlib.import_module(f"mitsuba_diffraction.{module}").define
         reason = None
         if not is_supported(variant):
             lacks = "vectorised kernels" if "spectral" in variant else "the wavelength of light"
@@ -36,7 +37,16 @@ def register_plugins(variant: str) -> None:
             )
         elif variant.startswith("llvm"):
             reason = llvm_problem()
-        getattr(mi, function)(name, functools.partial(_refuse, reason) if reason else define())
+        make = functools.partial(_refuse, reason) if reason else functools.partial(_make, module, variant)
+        getattr(mi, function)(name, make)
+
+
+def _make(module: str, variant: str, props: mi.Properties) -> mi.Object:
+    """Make a plugin, and before, if it is the first one of the variant, its class; called by several threads."""
+    with making:
+        if (module, variant) not in classes:
+            classes[module, variant] = importlib.import_module(f"mitsuba_diffraction.{module}").define()
+    return classes[module, variant](props)
 
 
 def _refuse(reason: str, props: mi.Properties) -> mi.Object:

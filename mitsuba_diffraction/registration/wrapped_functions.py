@@ -9,14 +9,17 @@ from __future__ import annotations
 import contextlib
 import functools
 import gc
+import threading
 from collections.abc import Callable, Collection, Iterator
 
 import mitsuba as mi
 
-from ..bsdf.base import living
-from ..bsdf.light import cover_light
-from ..bsdf.parameters import hand_over
 from ..errors import Bug, RequestError, root_cause
+from ..plugin_parameters import hand_over
+
+classes: dict[tuple[str, str], type] = {}
+"""Module and variant → class of a plugin. Not in `plugins`, which Mitsuba 3.10 reloads."""
+making = threading.Lock()
 
 
 def wrap_functions(plugins: Collection[str]) -> None:
@@ -53,8 +56,23 @@ def _with_short_errors(load: Callable[..., mi.Object], plugins: Collection[str])
 def _with_light(loaded: mi.Object) -> mi.Object:
     """Return a scene whose gratings cover its light; if they cannot, only this frame has referred to it."""
     if isinstance(loaded, mi.Scene):
-        cover_light(loaded)
+        _cover_light(loaded)
     return loaded
+
+
+def _cover_light(scene: mi.Scene, *sensor: mi.Sensor | int) -> None:
+    if classes:
+        from ..bsdf.light import cover_light
+
+        cover_light(scene, *sensor)
+
+
+def _count_gratings() -> int:
+    if not classes:
+        return 0
+    from ..bsdf.base import living
+
+    return len(living)
 
 
 _count = 0  # of gratings at the last picture
@@ -70,9 +88,9 @@ def _garbage_withheld() -> Iterator[None]:
     """
     global _count
     was_enabled = gc.isenabled()
-    if was_enabled and len(living) > _count:
+    if was_enabled and _count_gratings() > _count:
         gc.collect()
-    _count = len(living)
+    _count = _count_gratings()
     gc.disable()
     try:
         yield
@@ -92,7 +110,7 @@ def _with_light_covered(render: Callable[..., mi.TensorXf]) -> Callable[..., mi.
         scene: mi.Scene, params: object = None, sensor: mi.Sensor | int = 0, *args: object, **kwargs: object
     ) -> mi.TensorXf:
         if isinstance(scene, mi.Scene):
-            cover_light(scene, sensor)
+            _cover_light(scene, sensor)
         with _garbage_withheld():
             return render(scene, params, sensor, *args, **kwargs)
 

@@ -11,11 +11,10 @@ import json
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.interpolate import RegularGridInterpolator
 
 from ..errors import RequestError
 from ..rigorous.coordinate_transformation import curve_of, is_profile
@@ -25,6 +24,9 @@ from ..settings import VISIBLE
 from ..surface.heightfield import HeightField
 from ..surface.periods import height_spectrum
 from .closed_form import efficiency_difference, profile_powers, scalar_orders, transmitted_orders
+
+if TYPE_CHECKING:
+    from scipy.interpolate import RegularGridInterpolator
 
 Array = NDArray[np.float64]
 
@@ -71,6 +73,8 @@ def error_map(material: str = "dielectric") -> tuple[Array, Array, Array, Array]
 
 @functools.cache
 def _interpolated(material: str, largest_angle: float, mean: bool) -> RegularGridInterpolator:
+    from scipy.interpolate import RegularGridInterpolator
+
     periods, depths, directions, errors = error_map(material)
     errors = errors[..., directions[:, 0] <= largest_angle]
     error = errors.mean(axis=2) if mean else errors.max(axis=2)

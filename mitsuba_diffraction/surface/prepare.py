@@ -12,7 +12,6 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 from scipy import ndimage
-from scipy.interpolate import RectBivariateSpline, make_interp_spline
 
 from ..errors import RequestError, is_number
 from .heightfield import HeightField, harmonic_fill
@@ -228,6 +227,8 @@ def rotate(height_field: HeightField, degrees: float) -> HeightField:
     Raises:
         ValueError: if the angle is not a finite number, or no pixel fits into the rotated patch.
     """
+    from scipy.interpolate import RectBivariateSpline
+
     _check("rotate", degrees)
     quarters = degrees / 90
     if quarters == np.rint(quarters):
@@ -307,6 +308,8 @@ def _crop(
     heights: NDArray[np.float64], dimension: int, size: float, waves: Sequence[Period], axis: str
 ) -> tuple[NDArray[np.float64], float, str]:
     """Crop along one axis; return the heights, their pixel size, and a description."""
+    from scipy.interpolate import make_interp_spline
+
     count = heights.shape[dimension]
     q, uncertainty = (np.array(v) for v in zip(*(_component(wave, axis) for wave in waves), strict=True))
     across = np.flatnonzero(q * count * size >= 1 - 1e-9)
