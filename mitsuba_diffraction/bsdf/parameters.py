@@ -434,7 +434,11 @@ class GratingRequest:
     @property
     def known(self) -> tuple[KnownRange, ...]:
         """Where each index that the scene names is known."""
-        return *self.media.known, *self.material.known()
+        known = *self.media.known, *self.material.known()
+        settings = self.surface.settings if isinstance(self.surface, Recipe) else None
+        if isinstance(settings, RigorousSettings) and settings.material:
+            return *known, index_of("material", settings.material).known("material")
+        return known
 
     def widened(self, wavelengths: tuple[float, float]) -> Recipe | None:
         """Return the recipe for light of these wavelengths in air, nm; None for one that sets its own, or a file."""

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from ..errors import RequestError, check_whole, is_number
-from ..optics.materials import index_of
+from ..optics.materials import MAX_CLEAR_K, index_of
 from ..settings import MIN_WAVELENGTH, VISIBLE
 from .far_field import Array, blurred_texels
 
@@ -84,8 +84,10 @@ class Plate:
                 "at the horizon"
             )
         if self.int_ior is not None:
-            n = index_of("int_ior", self.int_ior)(self.wavelengths * 1e-3)
-            if n.imag.any() or not (1 < n.real.min() <= n.real.max() <= 10):
+            medium = index_of("int_ior", self.int_ior)
+            medium.known("int_ior").check((float(self.wavelengths.min()), float(self.wavelengths.max())))
+            n = medium(self.wavelengths * 1e-3)
+            if n.imag.max() > MAX_CLEAR_K or not (1 < n.real.min() <= n.real.max() <= 10):
                 raise RequestError(f"int_ior: got {self.int_ior!r}, wanted an index above 1, or none for a mirror")
         if self.levels is not None:
             check_whole("levels", self.levels, 2)

@@ -5,7 +5,7 @@ import re
 import mitsuba as mi
 import numpy as np
 import pytest
-from bsdf_support import albedo, direction, plugin
+from bsdf_support import albedo, direction, made_up, plugin
 
 import mitsuba_diffraction as md
 from mitsuba_diffraction.bsdf.base import gratings_in
@@ -322,6 +322,20 @@ def test_light_that_a_file_of_an_index_lacks_is_refused_by_parameter_file_and_ra
     refusal = rf"{parameter}: got light of 360 to 830 nm, and a table of {known} \(glass\.csv\)"
     with pytest.raises(RuntimeError, match=refusal):
         mi.load_dict(scene(bsdf))
+
+
+def test_light_that_the_material_of_a_rigorous_recipe_lacks_is_refused(llvm, tmp_path, monkeypatch):
+    table(tmp_path, "glass.csv", ["0.42,1.7,0", "0.68,1.6,0"])
+    recipe = tmp_path / "recipe.toml"
+    recipe.write_text(
+        '[surface]\nprofile = "sinusoidal"\nperiod = 0.7\ndepth = 0.1\n'
+        '[spectrum]\ntheory = "rigorous"\nmaterial = "glass.csv"\n'
+    )
+    monkeypatch.setattr(md.Recipe, "cached", lambda self, progress: made_up())  # which takes minutes
+    bsdf = {"type": "diffraction_grating", "filename": str(recipe)}
+    with pytest.raises(RuntimeError, match=r"material: got light of 360 to 830 nm, and a table of 420 to 680 nm"):
+        mi.load_dict(scene(bsdf))
+    mi.load_dict(scene(bsdf, (450, 600)))
 
 
 @pytest.mark.few(2)

@@ -163,7 +163,7 @@ def test_axes_describe_the_values():
         ({"height_field": md.HeightField(np.eye(64), 0.5)}, "about 20106 orders of a tile of 32 × 32 µm at 400 nm"),
         ({"azimuth": float("nan")}, "azimuth: got nan"),
         ({"azimuth": "x"}, "azimuth: got 'x'"),
-        ({"material": "Al", "wavelengths": 1550}, "got 'Al' at 1550 nm, wanted a wavelength from 298.8 to 885.6 nm"),
+        ({"material": "Al", "wavelengths": 1550}, "got light of 1550 nm, and a table of 298.757 to 885.601 nm"),
         ({"height_field": np.eye(4)}, "height_field: got ndarray, wanted a HeightField"),
     ],
 )

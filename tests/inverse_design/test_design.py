@@ -424,6 +424,10 @@ CENTRE[31:34, 31:34] = 1
         (np.eye(8), {"wavelengths": 0.532}, "wavelengths: got 0.532, wanted one or several in nm"),
         (np.eye(8), {"wavelengths": []}, r"wavelengths: got \[\], wanted one or several"),
         (np.eye(8), {"int_ior": 1}, "int_ior: got 1, wanted an index above 1"),
+        (
+            *(np.eye(8), {"int_ior": "keratin", "wavelengths": 900}),
+            r"int_ior: got light of 900 nm, and a table of 360 to 830 nm \(keratin\)",
+        ),
         (np.eye(8), {"levels": 1}, "levels: got 1, wanted a whole number of at least 2"),
         (np.eye(8), {"starts": 0}, "starts: got 0, wanted a whole number of at least 1"),
         (np.eye(8), {"seed": -1}, "seed: got -1, wanted a whole number of at least 0"),

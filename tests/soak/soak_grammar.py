@@ -226,6 +226,23 @@ class Configuration:
         result |= others
         return {name: value for name, value in result.items() if value is not None}
 
+    def with_table_that_ends(self, name, low, high, **others):
+        """The scene dictionary with a table from `low` to `high` nm in the place of the index of one parameter.
+
+        The last of films has it; `eta` stands for both spectra of a metal.
+        """
+        if name == "eta":
+            eta, k = spectra_that_end(self.material, low, high)
+            return self.dictionary(**others, material=None, eta=eta, k=k)
+        if name == "thin_film_ior":
+            indices = [given(n) for n, _ in self.films]
+            indices[-1] = file_that_ends(self.films[-1][0], low, high)
+            value = indices[0] if len(indices) == 1 else ", ".join(map(str, indices))
+        else:
+            medium = {"coat_ior": self.coat, "ext_ior": self.outside}.get(name, self.material)
+            value = file_that_ends(medium, low, high)
+        return self.dictionary(**others, **{name: value})
+
     def of_films(self):
         """The parameters of the films."""
         if len(self.films) > 1:
@@ -262,6 +279,29 @@ def _file(medium):
     wavelengths = np.arange(340, 861)
     path.write_text("".join(f"{w} {medium.at(w * 1e-3):.9g}\n" for w in wavelengths))
     return str(path)
+
+
+def table_that_ends(medium, low, high):
+    """λ in µm and n + ik of a medium from `low` to `high` nm, in rows of half a nanometre."""
+    wavelengths = 1e-3 * np.append(np.arange(low, high, 0.5), high)
+    return wavelengths, index_of(medium, wavelengths)
+
+
+@functools.lru_cache(maxsize=4096)
+def file_that_ends(medium, low, high):
+    """The file of such a table."""
+    path = Path(_folder().name) / f"{hash((medium, low, high)):x}.csv"
+    rows = (f"{x:.7g},{n.real:.9g},{n.imag:.9g}\n" for x, n in zip(*table_that_ends(medium, low, high), strict=True))
+    path.write_text("wl,n,k\n" + "".join(rows))
+    return str(path)
+
+
+def spectra_that_end(medium, low, high):
+    """Such a table as the spectra of η and k."""
+    wavelengths, index = table_that_ends(medium, low, high)
+    at = ", ".join(f"{1e3 * x:.7g}" for x in wavelengths)
+    values = (", ".join(f"{v:.9g}" for v in part) for part in (index.real, index.imag))
+    return [{"type": "irregular", "wavelengths": at, "values": of_part} for of_part in values]
 
 
 def _texel(value, texel):

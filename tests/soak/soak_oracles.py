@@ -634,6 +634,48 @@ def neutral_parameters_change_nothing(case: Case):
         same(case, other, f"(h) {name} = without", 2e-3, density=False, reference=plain, other_material=of_film)
 
 
+# (j) -----------------------------------------------------------------------------------------------------------------
+VISIBLE = (360.0, 830.0)
+
+
+def tables_hold_where_they_end(case: Case):
+    """(j) A table that ends in the place of an index: refused in white light, the same in light inside of it."""
+    c = case.c
+    if c.theory == "rigorous":
+        return
+    low, high = min(*c.wavelengths, 540.0) - 3, max(*c.wavelengths, 550.0) + 3  # with the nominal wavelength
+    plain = c.dictionary(conserve_energy=False)
+    named = [name for name in ("int_ior", "ext_ior", "coat_ior", "thin_film_ior") if name in plain]
+    named += ["material", "eta"] if c.material not in ("none", None) and "material" in plain else []
+    if not named or (low <= VISIBLE[0] and high >= VISIBLE[1]):
+        return
+    name = named[c.surface.seed % len(named)]
+    ended, refusal = c.with_table_that_ends(name, low, high, conserve_energy=False), None
+    try:
+        mi.load_dict(seen(ended, VISIBLE))
+    except RuntimeError as error:
+        refusal = str(error)
+    wanted = f"{name}: got light of 360 to 830 nm, and a table of {max(low, 0):g} to {high:g} nm"
+    case.require(
+        refusal is not None and wanted in refusal, "(j) refused outside of a table", got=refusal, wanted=wanted
+    )
+    inside = mi.load_dict(seen(ended, (low, high)))
+    same(
+        *(case, inside.shapes()[0].bsdf(), "(j) the same inside of a table", 1e-3),
+        **{"density": False, "reference": mi.load_dict(plain), "other_material": True, "name": name},
+    )
+
+
+def seen(bsdf, wavelengths):
+    """A scene of a BSDF in the light of wavelengths (shortest, longest)."""
+    first, last = wavelengths
+    band = {"type": "regular", "wavelength_min": first, "wavelength_max": last, "values": "1, 1"}
+    film = {"type": "specfilm", "width": 2, "height": 2, "band": band}
+    light = {"type": "constant", "radiance": {"type": "uniform", "value": 1.0}}
+    plate = {"type": "rectangle", "bsdf": bsdf}
+    return {"type": "scene", "sensor": {"type": "perspective", "film": film}, "light": light, "plate": plate}
+
+
 # (i) -----------------------------------------------------------------------------------------------------------------
 PIXELS, SAMPLES_PER_PIXEL = 8, 1 << 13
 INTEGRATORS = {
@@ -711,6 +753,7 @@ ORACLES = {
     "update": update_is_a_fresh_scene,
     "saved": saved_is_in_memory,
     "neutral": neutral_parameters_change_nothing,
+    "tables": tables_hold_where_they_end,
     "integrators": integrators_agree,
 }
 

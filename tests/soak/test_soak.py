@@ -83,7 +83,7 @@ CASES = {
 @pytest.mark.few(3)
 @pytest.mark.parametrize("name", CASES)
 def test_case(llvm, tmp_path, name):
-    judge(CASES[name], tmp_path, ("value", "density"))
+    judge(CASES[name], tmp_path, ("value", "density", "tables"))
 
 
 @pytest.mark.parametrize("fixed", [1, pytest.param(4, marks=pytest.mark.slow)])
