@@ -22,6 +22,7 @@ if TYPE_CHECKING:  # type checkers do not see what is imported on first use
     from .precomputation.grating_spectrum import GratingSpectrum
     from .precomputation.recipe import Recipe
     from .precomputation.spectra import precompute
+    from .render.example_scene import example_scene
     from .scalar_theory import reference
     from .surface import gratings
     from .surface.heightfield import HeightField
@@ -34,6 +35,7 @@ _HOME = {
     "Recipe": "precomputation.recipe",
     "design": "inverse_design",
     "efficiencies": "inspection.efficiency",
+    "example_scene": "render.example_scene",
     "gratings": "surface.gratings",
     "peak_efficiencies": "inspection.peaks",
     "precompute": "precomputation.spectra",
@@ -50,6 +52,7 @@ __all__ = [
     "Recipe",
     "design",
     "efficiencies",
+    "example_scene",
     "gratings",
     "peak_efficiencies",
     "precompute",
