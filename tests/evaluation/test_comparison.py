@@ -12,7 +12,7 @@ from bsdf_support import made_up
 from PIL import Image
 
 import mitsuba_diffraction as md
-from mitsuba_diffraction.evaluation.comparison import compare, summary
+from mitsuba_diffraction.evaluation.comparison import compare, figure, summary
 from mitsuba_diffraction.evaluation.comparison.difference import difference, noise, time_of_error, white_luminance
 from mitsuba_diffraction.evaluation.comparison.pictures import NO_SHADOWS, Pictures, supported_lights
 from mitsuba_diffraction.evaluation.comparison.quirk_shares import quirk_shares
@@ -413,7 +413,10 @@ def test_several_shaders_are_compared_with_their_options(llvm, folder):
     assert count == 1
     assert seconds > 0
     assert {*summary.titles(found).values()} >= {"GEM as published", "FLSS corrected"}
-    summary.save_figure(found, "figure.png", dpi=40)
+    for is_others in (False, True):
+        figure.save_figure(found, "figure.png", others=is_others)
+        with Image.open("figure.png") as picture:
+            assert picture.width == 1600
     assert summary.as_dict(found)["settings"] == {"terms": 6, "window": "texel"}
 
 
@@ -429,9 +432,9 @@ def test_the_same_seed_gives_the_same_numbers(llvm, folder):
         del one["pictures"], one["few_samples"]  # seconds
     assert numbers[0] == numbers[1]
     # There is a figure without the shares, too.
-    summary.save_figure(found[0], "figure.png", dpi=40)
+    figure.save_figure(found[0], "figure.png")
     with Image.open("figure.png") as picture:
-        assert picture.width > 400
+        assert picture.width == 1600
 
 
 def test_lights_that_the_shader_supports_are_found():
@@ -501,7 +504,7 @@ def test_a_failed_comparison_leaves_no_files(command, monkeypatch, llvm, folder,
     def fail(*args, **kwargs):
         raise error
 
-    monkeypatch.setattr(summary, "save_figure", fail)
+    monkeypatch.setattr(figure, "save_figure", fail)
     code, out, err = command("compare scene.xml --shader gem --spp 1 --width 4 --no-shares")
     assert (code, out) == (130 if isinstance(error, KeyboardInterrupt) else 1, "")
     assert len(err.splitlines()) == 1

@@ -73,22 +73,10 @@ FIGURES = (
         needs="a Python with bpy as $BLENDER_PYTHON, a checkout of Mitsuba-Blender as $ADDON (scenes/blender.py)",
     ),
     Figure(
-        ("compare.png",),
-        """mitsuba-diffraction compare scenes/elaphe.xml -D light=sun --shader flss --shader nmm --shader pq \
-            --shader gem --width 180 --spp 128 --shading-points 4 -o {out}/compare""",
-        5,
-    ),
-    Figure(
-        ("compare_pigment.png",),
-        """mitsuba-diffraction compare scenes/elaphe.xml -D light=sun --pigment --no-shares --width 180 --spp 128 \
-            --shading-points 4 -o {out}/compare_pigment""",
-        2,
-    ),
-    Figure(
-        ("compare_xenopeltis.png",),
-        """mitsuba-diffraction compare scenes/xenopeltis.xml -D light=sun --shader flss --shader nmm --shader pq \
-            --shader gem --width 180 --spp 128 --shading-points 4 -o {out}/compare_xenopeltis""",
-        5,
+        ("compare.jpg", "compare-others.jpg"),
+        """mitsuba-diffraction compare scenes/xenopeltis.xml -D light=sun --pigment --shader flss --shader nmm \
+            --shader pq --shader gem --width 516 --spp 64 --shading-points 2 -o {out}/compare""",
+        20,
     ),
     Figure(("design.png",), "mitsuba-diffraction design precompute/designed/cat.png -o {out}/design.gsf"),
     Figure(("eye_chart.png",), "python tools/manual/eye_chart.py {out}/eye_chart.png"),
@@ -97,6 +85,7 @@ FIGURES = (
         """mitsuba-diffraction efficiency ruled,lines_per_mm=1200 --theory rigorous --material Al --angle 17.5 \
             --wavelength 400:700:10 --plot {out}/efficiencies.png""",
     ),
+    Figure(("first_scene.png",), "python tools/manual/first_scene.py {out}/first_scene.png"),
     Figure(("inspect.png",), "mitsuba-diffraction inspect precompute/elaphe.toml -o {out}/inspect.png"),
     Figure(
         ("measured_gratings.png", "measured_transmission.png"),

@@ -59,7 +59,7 @@ def compare(
     from ...render.parsed_scene import files_of_scene
     from ...variants import choose_variant
     from ..comparison import compare as run
-    from ..comparison import summary
+    from ..comparison import figure, summary
     from ..comparison.pictures import supported_lights
     from ..realtime_shader.diffraction_shader import checked_brightness
 
@@ -77,10 +77,13 @@ def compare(
     if output is None or output.is_dir():
         folder = output or Path()
         prefix = folder / free_name(
-            f"{name}-{first}", lambda stem: [folder / f"{stem}{end}" for end in (*_PICTURES, ".png")], reads
+            f"{name}-{first}",
+            lambda stem: [folder / f"{stem}{end}" for end in (*_PICTURES, ".png", "-others.png")],
+            reads,
         )
     images = {f"{prefix}{end}": picture for end, picture in _PICTURES.items()}
-    written = [("-o", Path(target)) for target in (*images, f"{prefix}.png")]
+    figures = {f"{prefix}.png": False} | ({f"{prefix}-others.png": True} if others else {})
+    written = [("-o", Path(target)) for target in (*images, *figures)]
     written += [("--json", json)] if json is not None else []
     check_outputs(reads, written, overwrite=overwrite)
     mi.set_variant(choose_variant(variant))
@@ -106,7 +109,8 @@ def compare(
     with ExitStack() as files:  # all of them or none
         for target, picture in images.items():
             found.pictures[picture].image.save(files.enter_context(whole_file(target)))
-        summary.save_figure(found, files.enter_context(whole_file(f"{prefix}.png")))
+        for target, is_others in figures.items():
+            figure.save_figure(found, files.enter_context(whole_file(target)), others=is_others)
         if json is not None:
             save_json(summary.as_dict(found), files.enter_context(whole_file(json)))
     of_quirks = () if found.shares is None else (summary.quirk_table(found.shares),)

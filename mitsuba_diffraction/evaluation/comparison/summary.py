@@ -1,28 +1,18 @@
-"""Results of a comparison: tables for the terminal, notes, JSON, and a figure."""
+"""Results of a comparison: tables for the terminal, notes, and JSON."""
 
 from __future__ import annotations
 
 import dataclasses
-import os
-from typing import TYPE_CHECKING
 
 import numpy as np
-from numpy.typing import NDArray
 from rich.table import Table
 
-from ...files.outputs import METADATA
-from ...files.writing import whole_file
-from ...optics.color import XYZ_to_linear_sRGB, into_gamut, on_screen
 from ...progress import table
 from .. import report
 from ..realtime_shader.diffraction_shader import PUBLISHED_BRIGHTNESS
 from .pictures import NO_SHADOWS
 from .quirk_shares import MIN_EFFECT, QuirkShares
 from .side_by_side import Comparison
-
-if TYPE_CHECKING:
-    from matplotlib.axes import Axes
-    from matplotlib.figure import Figure
 
 CAUSES = {
     "schlick": "Schlick's Fresnel",
@@ -177,77 +167,3 @@ def as_dict(comparison: Comparison) -> dict[str, object]:
             name: {number: getattr(one, number) for number in _NUMBERS} for name, one in found[reference].items()
         }
     return found
-
-
-def shown(comparison: Comparison, name: str) -> NDArray[np.uint8]:
-    """Return a picture of the comparison for a display, at its exposure: (height, width, 3).
-
-    Diffraction alone is on black, as in the published pictures.
-    """
-    found = comparison.to_path_traced.get(name)
-    exposure = (1 if found is None else found.exposure) / comparison.white
-    xyz = comparison.pictures[name].xyz * exposure
-    if not comparison.pigment:
-        xyz = np.where(comparison.surface[..., None], xyz, 0)
-    return on_screen(into_gamut(XYZ_to_linear_sRGB(xyz)))
-
-
-def comparison_figure(comparison: Comparison) -> Figure:
-    """Plot the pictures, four to a row, below them CIEDE2000 to the path tracer's, and the effects of the quirks."""
-    from matplotlib.figure import Figure
-
-    aspect = comparison.surface.shape[0] / comparison.surface.shape[1]
-    names = titles(comparison)
-    rows = -(-len(names) // 4)
-    result = Figure(figsize=(12, rows * (5.5 * aspect + 0.8)), layout="constrained")
-    axes = result.subplots(2 * rows, 4)
-    limit = max(2.0, float(np.ceil(comparison.to_path_traced["published"].percentile_95)))
-    for panel in axes.ravel():
-        panel.set_axis_off()
-    for index, (name, title) in enumerate(names.items()):
-        row, column = divmod(index, 4)
-        axes[2 * row, column].imshow(shown(comparison, name), interpolation="nearest")
-        axes[2 * row, column].set_title(title, fontsize="large")
-        if (found := comparison.to_path_traced.get(name)) is not None:
-            panel = axes[2 * row + 1, column]
-            panel.set_axis_on()
-            image = panel.imshow(found.delta_e, cmap="inferno", vmin=0, vmax=limit, interpolation="nearest")
-            panel.set_facecolor("0.88")
-            panel.set(xticks=[], yticks=[])
-            panel.set_title(f"mean difference {found.mean:.1f}", fontsize="large")
-            panel.spines[:].set_visible(False)
-    bar = result.colorbar(image, ax=axes[1, 3], extend="max", pad=0.03)
-    bar.set_label("colour difference, CIEDE2000")
-    if comparison.shares is not None:
-        # Its labels do not widen the margin of the pictures.
-        panel = axes[1, 0].inset_axes((0.56, 0.17, 0.44, 0.8))
-        panel.set_in_layout(False)
-        _bars(panel, comparison.shares)
-    return result
-
-
-def _bars(panel: Axes, shares: QuirkShares) -> None:
-    """Plot `rise` and `drop` of the quirks."""
-    names = shares.visible()
-    positions = np.arange(len(names))
-    for offset, attribute, colour, label in (
-        (-0.2, "rise", "C0", "added"),
-        (0.2, "drop", "0.6", "corrected"),
-    ):
-        values = [getattr(shares.quirks[name], attribute) for name in names]
-        panel.barh(positions + offset, values, height=0.4, color=colour, label=label)
-    panel.axvline(0, color="0.3", linewidth=0.8)
-    panel.set_yticks(positions, [CAUSES[name] for name in names], fontsize="small")
-    panel.invert_yaxis()
-    panel.tick_params(axis="x", labelsize="small")
-    panel.set_xlabel("mean difference", fontsize="small")
-    widest = max(1.0, *map(abs, panel.get_xlim()))  # so that noise does not look like an effect
-    panel.set_xlim(min(panel.get_xlim()[0], -0.1 * widest), max(panel.get_xlim()[1], widest))
-    panel.legend(fontsize="x-small", frameon=False, loc=(0.42, 0.02), handlelength=0.7)
-    panel.spines[["top", "right"]].set_visible(False)
-
-
-def save_figure(comparison: Comparison, path: str | os.PathLike[str], dpi: float = 110) -> None:
-    """Write `figure` as PNG, atomically."""
-    with whole_file(path) as temporary:
-        comparison_figure(comparison).savefig(temporary, format="png", dpi=dpi, metadata=METADATA)
