@@ -61,9 +61,15 @@ class Coat:
             return [self.eta] * len(si.wavelengths)
         return [self.dispersion(wavelength).real for wavelength in si.wavelengths]
 
-    def cos_inside(self, cos: mi.Float) -> mi.Float:
-        """Return cos θ' for the cosine of an angle outside, in the middle of visible light."""
-        return dr.safe_sqrt(1 - (1 - dr.square(cos)) / dr.square(self.eta))
+    def per_nominal(self, wavelength: mi.Float) -> mi.Float:
+        """Return n of a layer with dispersion at a wavelength in nm, relative to n in the middle of visible light."""
+        assert self.dispersion is not None
+        return self.dispersion(wavelength).real / self.eta
+
+    def cos_inside(self, si: mi.SurfaceInteraction3f, cos: mi.Float) -> mi.Float | mi.UnpolarizedSpectrum:
+        """Return cos θ' for the cosine of an angle outside, with dispersion that of each wavelength."""
+        eta = self.eta if self.dispersion is None else mi.UnpolarizedSpectrum(self.etas(si))
+        return dr.safe_sqrt(1 - (1 - dr.square(cos)) / dr.square(eta))
 
     def reflectance(self, si: mi.SurfaceInteraction3f, cos: mi.Float) -> mi.UnpolarizedSpectrum:
         """Return F at the cosine of an angle outside."""

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Any
+from typing import Any, TypeAlias
 
 import drjit as dr
 import mitsuba as mi
@@ -16,14 +16,20 @@ from .coat import Coat
 from .device_tables import opaque
 from .indices import Dispersion, absolute_index, check_spectra, index_from, known_spectrum, nodes_of
 
+Cosines: TypeAlias = "mi.Float | mi.UnpolarizedSpectrum"
+
 
 class Material:
     """The reflectance of a material, from `__call__` or `powers`; by default it has no index and no parameters.
 
+    Indices are relative to that of the medium above in the middle of visible light, but for those that methods return,
+    which are relative to it at each wavelength. `cos_half` may be one cosine for each wavelength.
+
     Attributes:
         transparent: whether transmitted light is not absorbed.
         eta: relative index of refraction in the middle of visible light, a mi.Float; None without an index.
-        outside: absolute index of the medium above, to which indices are relative.
+        outside: absolute index of the medium above, to which indices are relative, in the middle of visible light.
+        coat: this medium if it has dispersion; else None.
         varies: whether the material varies over the surface.
         dispersion: the relative index of a transparent material over the wavelength; None if it is constant.
     """
@@ -31,15 +37,16 @@ class Material:
     transparent: bool = False
     eta: Any = None
     outside: float = 1.0
+    coat: Coat | None = None
     varies: bool = False
     dispersion: Dispersion | None = None
 
-    def __call__(self, si: mi.SurfaceInteraction3f, cos_half: mi.Float, active: mi.Bool) -> mi.UnpolarizedSpectrum:
+    def __call__(self, si: mi.SurfaceInteraction3f, cos_half: Cosines, active: mi.Bool) -> mi.UnpolarizedSpectrum:
         """Return R at the cosine ω_i·h, negative for light from below."""
         return self.powers(si, cos_half, active)[0]
 
     def powers(
-        self, si: mi.SurfaceInteraction3f, cos_half: mi.Float, active: mi.Bool
+        self, si: mi.SurfaceInteraction3f, cos_half: Cosines, active: mi.Bool
     ) -> tuple[mi.UnpolarizedSpectrum, mi.UnpolarizedSpectrum]:
         """Return R, and T of a transparent material, at the cosine ω_i·h."""
         reflected = self(si, cos_half, active)
@@ -52,6 +59,10 @@ class Material:
     def index(self, si: mi.SurfaceInteraction3f, active: mi.Bool) -> list[mi.Complex2f]:
         """Return n + ik of each wavelength."""
         raise NotImplementedError
+
+    def above(self, si: mi.SurfaceInteraction3f) -> list[mi.Float | float]:
+        """Return n of the medium above at each wavelength, relative to `outside`."""
+        return [1.0 if self.coat is None else self.coat.per_nominal(wavelength) for wavelength in si.wavelengths]
 
     def stack(self, eta: float) -> Stack:
         """Return the transparent material for E and samplers; `eta` replaces a constant index."""
@@ -82,9 +93,10 @@ def reflectance_from(props: mi.Properties, coat: Coat | None) -> Material:
         RequestError: if they contradict each other or are unknown.
     """
     own = [name for name in ("eta", "k") if name in props]
+    above = None if coat is None or coat.dispersion is None else coat
     if "material" not in props and not own:
         outside = coat.index if coat is not None else absolute_index("ext_ior", props.get("ext_ior", "air"))
-        return Dielectric(index_from("int_ior", props.get("int_ior", 1.5)), outside)
+        return Dielectric(index_from("int_ior", props.get("int_ior", 1.5)), outside, above)
     named = own[0] if own else "material"
     if "int_ior" in props or ("ext_ior" in props and "coat_ior" not in props):
         raise RequestError(
@@ -95,13 +107,13 @@ def reflectance_from(props: mi.Properties, coat: Coat | None) -> Material:
     if own:
         if "material" in props or own == ["k"]:
             raise RequestError(f"{named}: got {' and '.join(own)}, wanted eta and k, or material, one or the other")
-        return SpectralConductor(props.get_texture("eta"), props.get_texture("k", 0.0), outside)
+        return SpectralConductor(props.get_texture("eta"), props.get_texture("k", 0.0), outside, above)
     material = props["material"]
     if not isinstance(material, str):
         raise RequestError(f"material: got {material!r}, wanted the name of a conductor, such as 'Al', or 'none'")
     if material == "none":
         return PerfectMirror()
-    return Conductor(conductor_from(material), outside)
+    return Conductor(conductor_from(material), outside, above)
 
 
 def conductor_from(material: str) -> RefractiveIndex:
@@ -122,7 +134,7 @@ class PerfectMirror(Material):
     def __init__(self, name: str = "none (R = 1)") -> None:
         self.name = name
 
-    def __call__(self, si: mi.SurfaceInteraction3f, cos_half: mi.Float, active: mi.Bool) -> mi.UnpolarizedSpectrum:
+    def __call__(self, si: mi.SurfaceInteraction3f, cos_half: Cosines, active: mi.Bool) -> mi.UnpolarizedSpectrum:
         return mi.UnpolarizedSpectrum(1.0)
 
     def __repr__(self) -> str:
@@ -134,8 +146,8 @@ class Dielectric(Material):
 
     transparent = True
 
-    def __init__(self, medium: RefractiveIndex, outside: float) -> None:
-        self.medium, self.outside = medium, outside
+    def __init__(self, medium: RefractiveIndex, outside: float, coat: Coat | None = None) -> None:
+        self.medium, self.outside, self.coat = medium, outside, coat
         self.eta = mi.Float(medium.nominal.real / outside)
         if not medium.is_constant:
             self.dispersion = Dispersion(medium, outside)
@@ -158,12 +170,12 @@ class Dielectric(Material):
             )
 
     def _etas(self, si: mi.SurfaceInteraction3f) -> list[mi.Float]:
-        if self.dispersion is None:
-            return [self.eta] * len(si.wavelengths)
-        return [self.dispersion(wavelength).real for wavelength in si.wavelengths]
+        etas = [self.eta if self.dispersion is None else self.dispersion(w).real for w in si.wavelengths]
+        return etas if self.coat is None else [eta / above for eta, above in zip(etas, self.above(si), strict=True)]
 
-    def __call__(self, si: mi.SurfaceInteraction3f, cos_half: mi.Float, active: mi.Bool) -> mi.UnpolarizedSpectrum:
-        return mi.UnpolarizedSpectrum([mi.fresnel(cos_half, eta)[0] for eta in self._etas(si)])
+    def __call__(self, si: mi.SurfaceInteraction3f, cos_half: Cosines, active: mi.Bool) -> mi.UnpolarizedSpectrum:
+        pairs = zip(mi.UnpolarizedSpectrum(cos_half), self._etas(si), strict=True)
+        return mi.UnpolarizedSpectrum([mi.fresnel(cos, eta)[0] for cos, eta in pairs])
 
     def index(self, si: mi.SurfaceInteraction3f, active: mi.Bool) -> list[mi.Complex2f]:
         return [mi.Complex2f(eta, 0) for eta in self._etas(si)]
@@ -193,8 +205,8 @@ class Dielectric(Material):
 class SpectralConductor(Material):
     """A metal whose η + ik is given by two spectra, as in Mitsuba's `conductor`."""
 
-    def __init__(self, eta: mi.Texture, k: mi.Texture, outside: float) -> None:
-        self.textures, self.outside = (eta, k), outside
+    def __init__(self, eta: mi.Texture, k: mi.Texture, outside: float, coat: Coat | None = None) -> None:
+        self.textures, self.outside, self.coat = (eta, k), outside, coat
         self._divisor = None if outside == 1 else opaque(outside)
         self.varies = eta.is_spatially_varying() or k.is_spatially_varying()
         self.update()
@@ -205,13 +217,17 @@ class SpectralConductor(Material):
     def known(self) -> tuple[KnownRange, ...]:
         return tuple(known_spectrum(name, spectrum) for name, spectrum in zip(("eta", "k"), self.textures, strict=True))
 
-    def __call__(self, si: mi.SurfaceInteraction3f, cos_half: mi.Float, active: mi.Bool) -> mi.UnpolarizedSpectrum:
-        return mi.UnpolarizedSpectrum([mi.fresnel_conductor(cos_half, n) for n in self.index(si, active)])
+    def __call__(self, si: mi.SurfaceInteraction3f, cos_half: Cosines, active: mi.Bool) -> mi.UnpolarizedSpectrum:
+        pairs = zip(mi.UnpolarizedSpectrum(cos_half), self.index(si, active), strict=True)
+        return mi.UnpolarizedSpectrum([mi.fresnel_conductor(cos, n) for cos, n in pairs])
 
     def index(self, si: mi.SurfaceInteraction3f, active: mi.Bool) -> list[mi.Complex2f]:
         eta, k = (texture.eval(si, active) for texture in self.textures)
         if self._divisor is not None:
             eta, k = eta / self._divisor, k / self._divisor
+        if self.coat is not None:
+            above = mi.UnpolarizedSpectrum(self.above(si))
+            eta, k = eta / above, k / above
         return [mi.Complex2f(*of_channel) for of_channel in zip(eta, k, strict=True)]
 
     def planes(
@@ -230,7 +246,7 @@ class SpectralConductor(Material):
 class Conductor(SpectralConductor):
     """A metal of index η + ik, named as in Mitsuba's `conductor` or from a file; under a coat, relative to it."""
 
-    def __init__(self, medium: RefractiveIndex, outside: float) -> None:
+    def __init__(self, medium: RefractiveIndex, outside: float, coat: Coat | None = None) -> None:
         grid = nodes_of(medium)
         values = medium(grid * 1e-3) / outside
         # A look-up in an irregular table is a search, which took half of the rendering time.
@@ -245,7 +261,7 @@ class Conductor(SpectralConductor):
             else nested_plugin("uniform", value=0.0)  # Mitsuba takes no table of zeros
             for part in (values.real, values.imag)
         )
-        super().__init__(of_n, of_k, 1.0)
+        super().__init__(of_n, of_k, 1.0, coat)
         self.medium, self.outside = medium, outside
 
     def known(self) -> tuple[KnownRange, ...]:

@@ -212,7 +212,9 @@ class Grating:
                 of_one = self._pair(interface, *state)
                 return of_one, self.theory.reflectance(si_of_one, of_one[0], active)[0]
 
-            value, density = self._of_wavelengths(si, pending, at, (wi, wo, height_scale), lateral_scale)
+            # R is part of the loop, so that its derivative matters; Dr.Jit removes values that nothing uses.
+            derived = dr.grad_enabled(self.theory.reflectance(si, geometry, active))
+            value, density = self._of_wavelengths(si, pending, at, (wi, wo, height_scale), lateral_scale, derived)
             return dr.select(within, value, 0), density
 
         def constant(state: tuple, wavelength: mi.Float) -> tuple[_Pair, mi.Float | float]:
@@ -237,6 +239,7 @@ class Grating:
         at: Callable[[tuple, mi.Float], tuple[_Pair, mi.Float | float]],
         state: tuple,
         lateral_scale: mi.Float,
+        derived: bool = False,
     ) -> tuple[mi.UnpolarizedSpectrum, mi.Float]:
         """Return f cos θ_o at the wavelengths in `pending`, and the sum of their densities times n_o².
 
@@ -248,10 +251,11 @@ class Grating:
             at: returns the pair of directions, and a factor of the value, from `state` at a wavelength in nm.
             state: all arrays with derivatives.
             lateral_scale: of lengths along the surface.
+            derived: whether the factor that `at` returns has derivatives by other arrays.
         """
         value, density = mi.UnpolarizedSpectrum(0.0), mi.Float(0.0)
         add_wavelength = functools.partial(self._add_wavelength, si, at)
-        if dr.hint(dr.grad_enabled(state, lateral_scale), mode="scalar"):
+        if dr.hint(derived or dr.grad_enabled(state, lateral_scale), mode="scalar"):
             for _ in range(len(value)):
                 pending, value, density = add_wavelength(state, lateral_scale, pending, value, density)
         else:
@@ -312,11 +316,12 @@ class Grating:
         split = self.theory.split(value, si, self.frame(si, active), active)
         if self.coat is None and not interface.has_flat_face:
             return reflected(split, *directions, ctx.mode)
-        eta, has_face = interface.eta, [omega.z < 0 for omega in directions]
+        etas, has_face = [of_channel.eta for of_channel in at], [omega.z < 0 for omega in directions]
         if self.coat is not None:
-            eta, has_face = self.coat.eta, [mi.Bool(True)] * 2
-        inside = [interface.wave_vector(omega).inner() for omega in directions]
-        return through_layer(split, eta, directions, inside, has_face, ctx.mode)
+            etas, has_face = self.coat.etas(si), [mi.Bool(True)] * 2
+        of_each = at if interface.disperses else [interface]
+        inside = [[of_channel.wave_vector(omega).inner() for omega in directions] for of_channel in of_each]
+        return through_layer(split, mi.UnpolarizedSpectrum(etas), directions, inside, has_face, ctx.mode)
 
     def _covered(self, si: mi.SurfaceInteraction3f) -> tuple[list[mi.Bool], mi.SurfaceInteraction3f]:
         """Return which of the wavelengths the spectrum and the material cover, and the point with covered ones only.
@@ -344,7 +349,7 @@ class Grating:
         self, si: mi.SurfaceInteraction3f, cos: mi.Float, active: mi.Bool
     ) -> tuple[mi.UnpolarizedSpectrum, mi.UnpolarizedSpectrum]:
         _, si = self._covered(si)
-        return self.theory.material.powers(si, cos if self.coat is None else self.coat.cos_inside(cos), active)
+        return self.theory.material.powers(si, cos if self.coat is None else self.coat.cos_inside(si, cos), active)
 
     def sample(
         self,

@@ -28,9 +28,9 @@ def reflected(split: Split, wi: mi.Vector3f, wo: mi.Vector3f, mode: mi.Transport
 
 def through_layer(
     split: Split,
-    eta: mi.Float,
+    eta: mi.UnpolarizedSpectrum,
     outside: Sequence[mi.Vector3f],
-    inside: Sequence[mi.Vector3f],
+    inside: Sequence[Sequence[mi.Vector3f]],
     has_face: Sequence[mi.Bool],
     mode: mi.TransportMode,
 ) -> mi.Spectrum:
@@ -38,21 +38,24 @@ def through_layer(
 
     Args:
         split: of the grating alone, without the transmittances of the layer's face.
-        eta: index of the layer, relative to the outside.
-        outside, inside: (ω_i, ω_o) in the two media.
+        eta: index of the layer at each wavelength, relative to the outside.
+        outside, inside: (ω_i, ω_o) in the two media; inside those of each wavelength, or one pair for all of them.
         has_face: whether the face lies between the grating and ω_i, and ω_o.
         mode: of the transport.
     """
 
-    def face(which: int, cos: mi.Float, eta: mi.Float) -> mi.Spectrum:
-        matrix = mi.mueller.specular_transmission(mi.UnpolarizedSpectrum(dr.abs(cos)), mi.UnpolarizedSpectrum(eta))
+    def face(which: int, cos: mi.UnpolarizedSpectrum, eta: mi.UnpolarizedSpectrum) -> mi.Spectrum:
+        matrix = mi.mueller.specular_transmission(cos, eta)
         return dr.select(has_face[which], matrix, mi.mueller.absorber(mi.UnpolarizedSpectrum(1)))
 
     first, last = (0, 1) if mode == mi.TransportMode.Importance else (1, 0)
     # Directions inside and outside have the same plane of refraction, and therefore the same s axis.
     across = [_across(outside[which]) for which in (first, last)]
-    grating = split(inside[first], inside[last], *across)
-    matrix = face(last, inside[last].z, 1 / eta) @ grating @ face(first, outside[first].z, eta)
+    matrices = [split(pair[first], pair[last], *across) for pair in inside]
+    grating = matrices[0] if len(matrices) == 1 else _of_each_wavelength(matrices)
+    cosines = [mi.UnpolarizedSpectrum(dr.abs(omega.z)) for omega in outside]
+    cos_inside = dr.safe_sqrt(1 - (1 - dr.square(cosines[last])) / dr.square(eta))
+    matrix = face(last, cos_inside, 1 / eta) @ grating @ face(first, cosines[first], eta)
     source, exit_ = outside[first], outside[last]
     bases = mi.mueller.stokes_basis(-source), mi.mueller.stokes_basis(exit_)
     return mi.mueller.rotate_mueller_basis(matrix, -source, across[0], bases[0], exit_, across[1], bases[1])
@@ -128,6 +131,16 @@ def _matrix(value: mi.UnpolarizedSpectrum, entries: list[list[list[mi.Float]]]) 
                 entry[channel] = value[channel] * of_channel[row][column]
             matrix[row, column] = entry
     return matrix
+
+
+def _of_each_wavelength(matrices: list[mi.Spectrum]) -> mi.Spectrum:
+    """Return the matrix whose wavelengths are each from a matrix of its own."""
+    result = mi.Spectrum(0.0)
+    for row in range(4):
+        for column in range(4):
+            entries = [matrix[row, column][channel] for channel, matrix in enumerate(matrices)]
+            result[row, column] = mi.UnpolarizedSpectrum(entries)
+    return result
 
 
 def _across(omega: mi.Vector3f) -> mi.Vector3f:

@@ -20,7 +20,7 @@ from ..errors import RequestError
 from ..optics import film_stack
 from ..optics.materials import KnownRange, RefractiveIndex, is_file
 from .device_tables import PacketTable, integer_part, larger, limited, opaque
-from .fresnel import Material, PerfectMirror
+from .fresnel import Cosines, Material, PerfectMirror
 from .indices import MAX_INDEX_NODES, Dispersion, index_from, nodes_of
 from .varying import VaryingNumber, number_or_text
 
@@ -210,7 +210,8 @@ class _Filmed(Material):
     """
 
     def __init__(self, below: Material, films: list[RefractiveIndex], scale: VaryingNumber) -> None:
-        self.below, self.films, self.scale, self.outside = below, films, scale, below.outside
+        self.below, self.films, self.scale = below, films, scale
+        self.outside, self.coat = below.outside, below.coat
         self.transparent, self.dispersion = below.transparent, below.dispersion
 
     @property
@@ -242,7 +243,7 @@ class _Filmed(Material):
         return film_stack.Stack(self.outside, self.below.stack(eta).below, films, scales)
 
     def _waves(
-        self, si: mi.SurfaceInteraction3f, cos: mi.Float, active: mi.Bool, with_phase: bool
+        self, si: mi.SurfaceInteraction3f, cos: Cosines, active: mi.Bool, with_phase: bool
     ) -> list[tuple[list[Wave], mi.Float]]:
         """Return the waves of each wavelength and Re z_s/z_0; without their phase, total reflection has a real z_s."""
         raise NotImplementedError
@@ -254,7 +255,7 @@ class _Filmed(Material):
         return dr.select(cos < 0, n_s.real, 1), mi.Complex2f(dr.select(cos < 0, 1, n_s.real), 0)
 
     def powers(
-        self, si: mi.SurfaceInteraction3f, cos_half: mi.Float, active: mi.Bool
+        self, si: mi.SurfaceInteraction3f, cos_half: Cosines, active: mi.Bool
     ) -> tuple[mi.UnpolarizedSpectrum, mi.UnpolarizedSpectrum]:
         reflected, transmitted = [], []
         for both, factor in self._waves(si, cos_half, active, with_phase=False):
@@ -308,7 +309,8 @@ class FilmedMaterial(_Filmed):
         below = float(np.max(dr.detach(self.below.eta))) if self.transparent else 1.0
         if self.dispersion is not None:
             below = float(self.below.stack(below).below.values.real.max()) / self.outside
-        self.propagates = not self.films[0].absorbs and values.min() >= max(1.0, below)
+        above = 1.0 if self.coat is None else self.coat.medium.values.real.max() / self.outside
+        self.propagates = not self.films[0].absorbs and values.min() >= max(above, below)
 
     def thicknesses(self) -> tuple[np.ndarray, tuple[float, float]]:
         low, high = self.thickness.values[[0, -1]]
@@ -318,16 +320,18 @@ class FilmedMaterial(_Filmed):
         return np.array([high]), (float(low / high * low_scale), float(high_scale))
 
     def _waves(
-        self, si: mi.SurfaceInteraction3f, cos: mi.Float, active: mi.Bool, with_phase: bool
+        self, si: mi.SurfaceInteraction3f, cos: Cosines, active: mi.Bool, with_phase: bool
     ) -> list[tuple[list[Wave], mi.Float]]:
         thickness = self.thickness.at(si, active) * self.scale.at(si, active) * (self.outside * 1e3)
         real, found = self.propagates and self.transparent and not with_phase, []
-        for wavelength, n_s in zip(si.wavelengths, self.below.index(si, active), strict=True):
+        of_each = zip(si.wavelengths, mi.UnpolarizedSpectrum(cos), self.below.index(si, active), strict=True)
+        for (wavelength, cosine, n_s), above in zip(of_each, self.above(si), strict=True):
             n = self.film(wavelength) if isinstance(self.film, Dispersion) else mi.Complex2f(self.film, 0)
-            plane = _Plane.of(dr.abs(cos), *self._media(cos, n_s), real)
-            fields, across = _crossed(
-                plane.fields(), mi.Complex2f(1, 0), n, thickness / wavelength, plane.square, self.propagates
-            )
+            plane = _Plane.of(dr.abs(cosine), *self._media(cosine, n_s), real)
+            depth = thickness / wavelength
+            if self.coat is not None:
+                n, depth = n / above, depth * above
+            fields, across = _crossed(plane.fields(), mi.Complex2f(1, 0), n, depth, plane.square, self.propagates)
             found.append((plane.waves(fields, across), plane.z_s.real / plane.z_0))
         return found
 
@@ -376,19 +380,20 @@ class StackedMaterial(_Filmed):
         return np.array(dr.detach(self.thickness), np.float64), (float(low), float(high))
 
     def _waves(
-        self, si: mi.SurfaceInteraction3f, cos: mi.Float, active: mi.Bool, with_phase: bool
+        self, si: mi.SurfaceInteraction3f, cos: Cosines, active: mi.Bool, with_phase: bool
     ) -> list[tuple[list[Wave], mi.Float]]:
         scale, nodes = self.scale.at(si, active) * (self.outside * 1e3), integer_part(self.nodes)
         planes, starts, fractions, state = [], [], [], []
-        for wavelength, n_s in zip(si.wavelengths, self.below.index(si, active), strict=True):
-            planes.append(_Plane.of(dr.abs(cos), *self._media(cos, n_s), False))
+        cosines, aboves = mi.UnpolarizedSpectrum(cos), self.above(si)
+        for wavelength, cosine, n_s in zip(si.wavelengths, cosines, self.below.index(si, active), strict=True):
+            planes.append(_Plane.of(dr.abs(cosine), *self._media(cosine, n_s), False))
             x = limited((wavelength - self.first) * self.per_nanometre, 0, self.nodes - 1)
             node = dr.minimum(integer_part(x), nodes - 2)
             starts.append(node)
             fractions.append(x - mi.Float(mi.Int32(node)))
             (b, c), (d, e) = planes[-1].fields()
             state += [b, c, d, e, mi.Complex2f(1, 0)]
-        films, from_below = integer_part(self.count), cos < 0
+        films, from_below = integer_part(self.count), cosines[0] < 0
 
         def body(step: mi.UInt32, *state: mi.Complex2f) -> tuple[Any, ...]:
             # From the innermost film outwards; for light from below, from the outermost inwards.
@@ -399,6 +404,8 @@ class StackedMaterial(_Filmed):
                 at = film * nodes + node
                 n = mi.Complex2f(*dr.lerp(self.table(at, active), self.table(at + 1, active), fraction))
                 depth = thickness / si.wavelengths[channel]
+                if self.coat is not None:
+                    n, depth = n / aboves[channel], depth * aboves[channel]
                 (first, second), across = _crossed([(b, c), (d, e)], across, n, depth, plane.square, False)
                 following += [*first, *second, across]
             return step + 1, *following

@@ -3,6 +3,7 @@
 import mitsuba as mi
 import numpy as np
 import pytest
+import tmm
 from bsdf_support import array, check_chi_square, direction, interaction, random_directions, use, vectors
 
 import mitsuba_diffraction as md
@@ -216,3 +217,102 @@ def test_a_coat_without_its_wavelengths_is_refused(llvm):
     spectrum = md.precompute(md.gratings.blazed(2.5, 0.25))
     with pytest.raises(RuntimeError, match=r"build it from 232\.3 nm"):
         mi.load_dict({"type": "diffraction_grating", "spectrum": spectrum, "coat_ior": INDEX})
+
+
+def polycarbonate(wavelength):
+    """n by Sultanova, Kasarova and Nikolov 2009, λ in µm."""
+    return np.sqrt(1 + 1.4182 * wavelength**2 / (wavelength**2 - 0.021304))
+
+
+def keratin(wavelength):
+    """n by Leertouwer, Wilts and Stavenga 2011, λ in µm."""
+    return 1.532 + 5.89e-3 / wavelength**2
+
+
+def constant(n):
+    return lambda wavelength: n
+
+
+BELOW = {
+    # The parameters of a scene; the films from the outside in, n(λ) and thickness in µm; n(λ) of the material.
+    "keratin": ({"int_ior": "keratin"}, [], keratin),
+    "number": ({"int_ior": 1.7}, [], constant(1.7)),
+    "itself": ({"int_ior": "polycarbonate"}, [], polycarbonate),
+    "metal": ({"eta": 0.8, "k": 3.0}, [], constant(0.8 + 3j)),
+    "film": (
+        {"int_ior": "keratin", "thin_film_ior": 2.35, "thin_film_thickness": 0.7},
+        [(constant(2.35), 0.7)],
+        keratin,
+    ),
+    "low film": (
+        {"int_ior": 1.9, "thin_film_ior": "keratin", "thin_film_thickness": 0.7},
+        [(keratin, 0.7)],
+        constant(1.9),
+    ),
+    "film of the coat": (
+        {"int_ior": 1.9, "thin_film_ior": "polycarbonate", "thin_film_thickness": 0.7},
+        [(polycarbonate, 0.7)],
+        constant(1.9),
+    ),
+    "stack on metal": (
+        {"eta": 0.8, "k": 3.0, "thin_film_ior": "keratin, 2.35", "thin_film_thickness": "0.5, 0.3"},
+        [(keratin, 0.5), (constant(2.35), 0.3)],
+        constant(0.8 + 3j),
+    ),
+    "stack": (
+        {"int_ior": "keratin", "thin_film_ior": "2.35, 1.38", "thin_film_thickness": "0.5, 0.3"},
+        [(constant(2.35), 0.5), (constant(1.38), 0.3)],
+        keratin,
+    ),
+}
+LIGHT = np.array([380.0, 450.0, 550.0, 700.0])
+
+
+def under_polycarbonate(below, sine, wavelength):
+    """R and T of a plane under polycarbonate, and T of its face, by `tmm`, (3, 2) for s and p; λ in µm."""
+    _, films, substrate = BELOW[below]
+    coat = polycarbonate(wavelength)
+    n = [coat, *(index(wavelength) for index, _ in films), substrate(wavelength)]
+    d = [np.inf, *(thickness for _, thickness in films), np.inf]
+    found = [tmm.coh_tmm(which, n, d, np.arcsin(sine / coat), wavelength) for which in "sp"]
+    faces = [tmm.coh_tmm(which, [1, coat], [np.inf] * 2, np.arcsin(sine), wavelength)["T"] for which in "sp"]
+    return np.array([*([of[key] for of in found] for key in "RT"), faces])
+
+
+@pytest.mark.few(4)
+@pytest.mark.parametrize("polarised", [False, True], ids=["spectral", "polarised"])
+@pytest.mark.parametrize("theta", [0.0, 60.0])
+@pytest.mark.parametrize("below", BELOW)
+def test_below_a_coat_with_dispersion_the_reflectance_has_both_indices_of_each_wavelength(below, theta, polarised):
+    """A flat surface in the mirror direction, against a perfect mirror, which depolarises, below the same coat."""
+    use("llvm_ad_spectral_polarized" if polarised else "llvm_ad_spectral")
+    flat = md.precompute(md.HeightField(np.zeros((16, 16)), 0.05), wavelengths=(210, 830))
+    parameters = {"type": "diffraction_grating", "spectrum": flat, "coat_ior": "polycarbonate", "ext_ior": 1.0}
+    wi = direction(theta)
+    wo = wi * [-1, -1, 1]
+    bsdf, mirror = (mi.load_dict(parameters | others) for others in (BELOW[below][0], {"material": "none"}))
+    found, of_mirror = (testing.evaluate(one, wi, wo, LIGHT) for one in (bsdf, mirror))
+    wanted = []
+    for wavelength in LIGHT * 1e-3:
+        reflected, _, face = under_polycarbonate(below, np.sin(np.deg2rad(theta)), wavelength)
+        # Of unpolarised light, whose two parts are transmitted by the face twice.
+        wanted.append(np.mean(face**2 * reflected) / np.mean(face) ** 2 if polarised else np.mean(reflected))
+    np.testing.assert_allclose(found / of_mirror, wanted, rtol=1e-3, atol=1e-6)
+
+
+@pytest.mark.few(2)
+@pytest.mark.parametrize("theta", [0.0, 60.0])
+@pytest.mark.parametrize("below", [name for name, (_, _, index) in BELOW.items() if np.isreal(index(0.5))])
+def test_below_a_coat_with_dispersion_the_base_has_the_transmittance_of_each_wavelength(llvm, below, theta):
+    base = {"type": "diffuse", "reflectance": {"type": "uniform", "value": 0.5}}
+    bsdf = coated("lamellar", coat_ior="polycarbonate", ext_ior=1.0, base=base, **BELOW[below][0])
+    wi, wo = direction(theta, 30), direction(20.0, 200)
+    context = mi.BSDFContext()
+    context.component = 1
+    value = testing.evaluate_pdf(bsdf, wi, wo, LIGHT, context)[0]
+    for found, wavelength in zip(value, LIGHT * 1e-3, strict=True):
+        wanted = 0.5 / np.pi * wo[2]
+        for omega in (wi, wo):
+            _, transmitted, face = under_polycarbonate(below, np.sqrt(1 - omega[2] ** 2), wavelength)
+            wanted *= face.mean() * transmitted.mean()
+        assert found == pytest.approx(wanted, rel=2e-4)

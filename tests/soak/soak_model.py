@@ -13,8 +13,6 @@ from pathlib import Path
 import mitsuba as mi
 import numpy as np
 
-NOMINAL = 0.547  # µm
-
 
 @functools.cache
 def metal(name):
@@ -149,8 +147,7 @@ class Model:
         c = self.c
         if c.material == "none":
             return np.ones_like(cosine), np.zeros_like(cosine)
-        # A coat with dispersion has its nominal index for the reflectance of the material.
-        n_0, n_2 = self.above(NOMINAL if isinstance(c.coat, Cauchy) else wavelength), index_of(c.material, wavelength)
+        n_0, n_2 = self.above(wavelength), index_of(c.material, wavelength)
         films = [(index_of(n, wavelength), at.film_scale * thickness) for n, thickness in c.films]
         above = plane(cosine, n_0, films, n_2, wavelength)
         if np.all(from_above):
@@ -266,9 +263,7 @@ class Model:
         for omega in (wi, wo):
             cos = omega[:, 2]
             if c.coat:
-                # Films under a coat with dispersion have the phase of light in its nominal index.
-                inside = self.above(NOMINAL if isinstance(c.coat, Cauchy) else wavelength)
-                cos = np.sqrt(1 - (1 - cos**2) * (c.outside / inside) ** 2)
+                cos = np.sqrt(1 - (1 - cos**2) * (c.outside / self.above(wavelength)) ** 2)
             result = result * self.of_plane(cos, True, wavelength, at)[1]
         return result * c.base / np.pi
 

@@ -10,7 +10,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 from soak_grammar import TEXTURES, Configuration, given, texture, uv
-from soak_model import Cauchy, Model, index_of, plane
+from soak_model import Model, index_of, plane
 
 from mitsuba_diffraction import testing
 
@@ -561,9 +561,10 @@ def update_is_a_fresh_scene(case: Case):
             values[f"{parameter}.data"] = np.float32(texels).reshape(1, 4, 1)
         else:
             values[parameter + (".value" if name == "orientation" else "")] = value
-    if isinstance(c.material, float) and c.material > 1.1 and not isinstance(c.coat, Cauchy) and c.theory == "scalar":
+    if isinstance(c.material, float) and c.material > 1.1 and c.theory == "scalar":
         lower = 1.02 + (c.material - 1.02) * factor
-        relative = (c.coat or c.outside) if c.transmission == "none" else c.outside
+        # The parameter is relative to the index in the middle of visible light, at √(360 · 830) nm.
+        relative = index_of(c.coat or c.outside, np.sqrt(0.36 * 0.83)).real if c.transmission == "none" else c.outside
         is_recipe = c.surface.by_name and c.transmission != "none"  # for the light inside of the first index
         if abs(lower - c.outside) > 0.03 and (lower > c.outside) == (c.material > c.outside) and not is_recipe:
             changes["material"] = lower
@@ -603,7 +604,6 @@ def neutral_parameters_change_nothing(case: Case):
     if c.theory == "rigorous":
         return
     if not c.films and c.material != "none":
-        # Films under a coat with dispersion have the phase of light in its nominal index.
         above = given(c.outside if c.coat is None else c.coat)
         changed += [
             ("film of no thickness", {"thin_film_ior": 2.0, "thin_film_thickness": 0.0}),
@@ -612,9 +612,8 @@ def neutral_parameters_change_nothing(case: Case):
                 "films of the index below",
                 {"thin_film_ior": f"2 x ({given(c.material)})", "thin_film_thickness": "0.1, 0.2"},
             ),
+            ("film of the index above", {"thin_film_ior": above, "thin_film_thickness": 0.1}),
         ]
-        if not isinstance(c.coat, Cauchy):
-            changed += [("film of the index above", {"thin_film_ior": above, "thin_film_thickness": 0.1})]
     if c.coat is None and c.transmission == "none":
         changed.append(("coat of the index outside", {"coat_ior": c.outside, "ext_ior": c.outside}))
     if c.height_scale == 1:
