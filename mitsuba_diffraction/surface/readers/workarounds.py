@@ -1,5 +1,7 @@
 """Work-arounds for SurfaceTopography: valid files that it refuses or misreads are rewritten first.
 
+`tools/surfacetopography.md` has the smallest file for each, and what would make the work-around needless.
+
 - .tmd: the comment has any length; the library reads 24 bytes.
 - .x3p (ISO 25178-72): a zipped folder, heights as text in main.xml, empty offsets, invalid dates, and dashes in the
   revision are common; the library accepts none of them.
