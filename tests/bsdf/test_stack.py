@@ -257,6 +257,22 @@ def test_films_from_files_whose_names_have_commas_and_parentheses(llvm, tmp_path
         assert [film.nominal for film in films] == pytest.approx(wanted)
 
 
+def test_a_table_that_ends_in_the_far_infrared_is_as_fine_in_visible_light(llvm, tmp_path):
+    # Regression: the nodes of a table that ends at 200 µm were 50 nm apart.
+    file = tmp_path / "a.csv"
+    rows = "".join(f"{x / 1000},{1.5 + x % 20 / 20}\n" for x in range(300, 910, 10))
+    file.write_text(f"wl,n\n{rows}200,1.5\n")
+    film, stack = {"int_ior": 1.3, "thin_film_thickness": 0.1}, {"int_ior": 1.3, "thin_film_thickness": "0.1, 0.1"}
+    for found, wanted in (
+        ({"int_ior": str(file)}, {"int_ior": 2.0}),
+        ({"material": str(file)}, {"int_ior": 2.0, "ext_ior": 1.0}),
+        ({**film, "thin_film_ior": str(file)}, {**film, "thin_film_ior": 2.0}),
+        ({**stack, "thin_film_ior": f"{file}, {file}"}, {**stack, "thin_film_ior": "2, 2"}),
+    ):
+        of_table, of_number = (powers(load(**given), [0.9], [510.0])[0] for given in (found, wanted))
+        np.testing.assert_allclose(of_table, of_number, rtol=1e-4)
+
+
 def test_one_film_given_as_texts_is_one_film(llvm):
     texts = load(int_ior=1.5, thin_film_ior="1.38", thin_film_thickness="0.1", thin_film_scale="2")
     numbers = load(int_ior=1.5, thin_film_ior=1.38, thin_film_thickness=0.1, thin_film_scale=2.0)
