@@ -341,8 +341,8 @@ def test_light_that_the_material_of_a_rigorous_recipe_lacks_is_refused(llvm, tmp
 @pytest.mark.few(2)
 @pytest.mark.parametrize("named", NAMED)
 def test_an_infrared_table_is_the_index_in_infrared_light(llvm, tmp_path, named):
-    # Elsewhere another one; but media above, and directions of transmitted light, have one index where tables begin.
-    n = N if named in ("int_ior, transmission", "ext_ior", "coat_ior") else 1.2
+    # Elsewhere another one; but ext_ior, and the samples of transmitted light, have one index, where the table begins.
+    n = N if named in ("int_ior, transmission", "ext_ior") else 1.2
     file = table(tmp_path, "infrared.csv", [f"{x},{y},0" for x, y in ((2, n), (2.9, n), (2.96, N), (3.24, N), (5, n))])
     assert mean(with_file(named, file), (3000.0, 3200.0)) == pytest.approx(NAMED[named][1], rel=0.02)
 
