@@ -1,9 +1,11 @@
-"""Exceptions: mistakes of the caller, failures of the environment, bugs of this package; checks of numbers."""
+"""Exceptions: mistakes of the caller, failures of the environment, bugs of this package; what their messages quote."""
 
 from __future__ import annotations
 
 import builtins
+import os
 import re
+import shlex
 import sys
 from collections.abc import Iterable
 from difflib import get_close_matches
@@ -55,6 +57,21 @@ def did_you_mean(name: str, known: Iterable[str]) -> str:
     """Return the known name most similar to a wrong one, as the end of a message, or "" if none is similar."""
     similar = get_close_matches(name.lower(), known, n=1)
     return f"; did you mean {similar[0]}?" if similar else ""
+
+
+def shell_command(*words: str) -> str:
+    """Return a command that a message proposes, quoted for the shell of the system.
+
+    On Windows, for cmd, which takes ' as a character, as well as for PowerShell, to which a comma ends a word.
+    """
+    if os.name != "nt":
+        return shlex.join(words)
+    return " ".join(word if re.fullmatch(r"[\w.:=/\\\[\]+-]+", word) else f'"{word}"' for word in words)
+
+
+def pip_install(extra: str) -> str:
+    """Return the command that installs an extra of this package."""
+    return shell_command("pip", "install", f"mitsuba_diffraction[{extra}]")
 
 
 def root_cause(error: BaseException) -> str:

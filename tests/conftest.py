@@ -7,6 +7,7 @@ import signal
 import sys
 import warnings
 from collections import defaultdict
+from contextlib import contextmanager
 from pathlib import Path
 
 import numpy as np
@@ -67,6 +68,8 @@ def pytest_collection_modifyitems(items):
         if not (takes_long or marked or item.function in tests):
             tests.add(item.function)
             item.add_marker(pytest.mark.quick)
+        if (posix := item.get_closest_marker("posix")) and os.name != "posix":
+            item.add_marker(pytest.mark.skip(reason=f"{posix.args[0]}: not on {sys.platform}"))
 
 
 @pytest.fixture(scope="module", autouse=True)
@@ -103,6 +106,23 @@ def ctrl_c():
     before = signal.signal(signal.SIGINT, signal.default_int_handler)
     yield
     signal.signal(signal.SIGINT, before)
+
+
+@pytest.fixture
+def full_disk():
+    """full_disk(size): a context in which no file becomes larger, not even one of the superuser; for marked `posix`."""
+    import resource
+
+    @contextmanager
+    def limit(size):
+        soft, hard = resource.getrlimit(resource.RLIMIT_FSIZE)
+        resource.setrlimit(resource.RLIMIT_FSIZE, (size, hard))
+        try:
+            yield
+        finally:
+            resource.setrlimit(resource.RLIMIT_FSIZE, (soft, hard))
+
+    return limit
 
 
 @pytest.fixture

@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 import functools
-import shlex
 import webbrowser
 from pathlib import Path
 from typing import Annotated, Any
 
 import typer
 
+from ..errors import shell_command
 from ..files.outputs import check_outputs
 from ..files.writing import whole_file
 from ..precomputation.recipe import Recipe
@@ -94,7 +94,7 @@ def _surface(context: typer.Context, name: str, parameters: dict[str, Any], reci
     spectrum = f"{path.stem}.exr"
     extent = {"extent": recipe.settings.extent} if is_scan(name) else {}
     options = _words(given_of(context, SCAN_OPTIONS) | extent)
-    command = shlex.join([NAME, "precompute", path.name, *options, "-o", spectrum])
+    command = shell_command(NAME, "precompute", path.name, *options, "-o", spectrum)
     return Surface.of_recipe(recipe, path.stem, {"filename": spectrum}, parameters, progress, command)
 
 

@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
-import fcntl
 import glob
 import hashlib
 import io
 import os
 import secrets
+import time
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
@@ -18,6 +18,9 @@ import platformdirs
 from ..errors import RequestError
 
 _being_written: set[str] = set()  # temporary paths
+_RENAMING_TRIES = 10
+_SECONDS_BETWEEN_TRIES = 0.1
+_OPEN_ELSEWHERE = {5, 32}  # error codes of Windows, which renames no file over one that a program has open
 
 
 @contextmanager
@@ -26,13 +29,15 @@ def whole_file(path: str | os.PathLike[str]) -> Iterator[Path]:
 
     A reader sees either the old or the new file, whichever process writes it, and after the block the new file is on
     disk (fsync). If the block raises, including KeyboardInterrupt, the temporary file is removed and `path` is left
-    unchanged. The temporary name has the suffix of `path`, by which writers choose the format. It is locked while it
-    is being written; unlocked ones, left by killed processes, are removed here. Symbolic links are followed.
+    unchanged. The temporary name has the suffix of `path`, by which writers choose the format. A lock beside it is held
+    while it is being written; temporary files without one, left by killed processes, are removed here. Symbolic links
+    are followed.
 
     Raises:
         FileNotFoundError: if the folder does not exist.
         ValueError: if `path` exists and is not an ordinary file.
-        OSError: if it cannot be written (no space, no permission); `path` is left unchanged.
+        OSError: if it cannot be written (no space, no permission, on Windows a program that has `path` open); `path`
+            is left unchanged.
     """
     target = Path(os.path.realpath(path))
     if str(target) in _being_written:  # a writer called with a temporary path
@@ -43,27 +48,48 @@ def whole_file(path: str | os.PathLike[str]) -> Iterator[Path]:
     if target.exists() and not target.is_file():
         raise RequestError(f"cannot write {os.fspath(path)!r}: it exists and is not an ordinary file")
     _remove_stale_temporaries(target)
-    temporary, opened = _locked_temporary(target)
+    # Not tempfile.mkstemp, whose files are readable by their owner only, also after the rename.
+    temporary = target.with_name(f".{target.stem}-{secrets.token_hex(8)}{target.suffix}")
     _being_written.add(str(temporary))
     try:
-        yield temporary
-        os.fsync(opened)
-        os.replace(temporary, target)
+        with _locked(_lock_of_temporary(temporary), wait=True):
+            try:
+                temporary.touch(exist_ok=False)
+                yield temporary
+                with open(temporary, "r+b") as stream:
+                    os.fsync(stream.fileno())
+                _rename(temporary, target)
+            finally:
+                with suppress(OSError):
+                    temporary.unlink(missing_ok=True)
     except OSError as error:
         if error.errno is None or error.filename not in (None, str(temporary)):
             raise
         # A full disk, with the name that the caller knows.
         raise OSError(error.errno, error.strerror, os.fspath(path)) from error
     finally:
-        with suppress(OSError):
-            temporary.unlink(missing_ok=True)
         _being_written.remove(str(temporary))
-        os.close(opened)
-    folder = os.open(target.parent, os.O_DIRECTORY)
-    try:
-        os.fsync(folder)  # makes the rename itself durable
-    finally:
-        os.close(folder)
+    if hasattr(os, "O_DIRECTORY"):  # Windows opens no folders
+        folder = os.open(target.parent, os.O_DIRECTORY)
+        try:
+            os.fsync(folder)  # makes the rename itself durable
+        finally:
+            os.close(folder)
+
+
+def _rename(temporary: Path, target: Path) -> None:
+    """Rename a file; while a program on Windows, such as a viewer, has `target` open, try for a second."""
+    for remaining in reversed(range(_RENAMING_TRIES)):
+        try:
+            os.replace(temporary, target)
+            return
+        except PermissionError as error:
+            if getattr(error, "winerror", None) not in _OPEN_ELSEWHERE:
+                raise
+            if not remaining:
+                problem = "another program has it open, or it is write-protected"
+                raise PermissionError(error.errno, problem, str(target)) from None
+        time.sleep(_SECONDS_BETWEEN_TRIES)
 
 
 def examples_folder() -> Path:
@@ -99,31 +125,43 @@ def exclusive(path: str | os.PathLike[str]) -> Iterator[None]:
         RequestError: if another process is in it.
     """
     path = Path(path)
-    lock = path.with_name(f".{path.name}.lock")
-    with lock.open("wb") as stream:
-        try:
-            fcntl.flock(stream, fcntl.LOCK_EX | fcntl.LOCK_NB)
-        except BlockingIOError:
-            raise RequestError(f"{path}: another process is writing it, wanted one at a time") from None
-        except OSError:  # a file system without locks
-            pass
-        try:
+    try:
+        with _locked(path.with_name(f".{path.name}.lock")):
             yield
-        finally:
-            lock.unlink(missing_ok=True)
+    except _HeldElsewhere:
+        raise RequestError(f"{path}: another process is writing it, wanted one at a time") from None
 
 
-def _locked_temporary(target: Path) -> tuple[Path, int]:
-    """Return a new file next to `target`, and the descriptor that holds its lock."""
-    while True:
-        # Not tempfile.mkstemp, whose files are readable by their owner only, also after the rename.
-        temporary = target.with_name(f".{target.stem}-{secrets.token_hex(8)}{target.suffix}")
-        opened = os.open(temporary, os.O_RDWR | os.O_CREAT | os.O_EXCL, 0o666)
-        with suppress(OSError):  # a file system without locks
-            fcntl.flock(opened, fcntl.LOCK_EX)
-        if temporary.exists():  # not removed as a leftover by another process before it was locked
-            return temporary, opened
-        os.close(opened)
+class _HeldElsewhere(Exception):
+    """Another process holds a lock."""
+
+
+@contextmanager
+def _locked(file: Path, wait: bool = False) -> Iterator[bool]:
+    """Hold a lock file, which is removed afterwards; yield False where the file system has no locks.
+
+    Raises:
+        _HeldElsewhere: if another process holds it, unless `wait`.
+    """
+    from filelock import FileLock, Timeout  # takes 0.1 s
+
+    lock = FileLock(file, timeout=-1 if wait else 0)
+    with suppress(OSError):
+        try:
+            lock.acquire()
+        except Timeout:
+            raise _HeldElsewhere from None
+    try:
+        yield lock.is_locked
+    finally:
+        if lock.is_locked:
+            with suppress(OSError):  # before it is released, which on Windows removes it
+                file.unlink()
+            lock.release()
+
+
+def _lock_of_temporary(temporary: Path) -> Path:
+    return temporary.with_name(f"{temporary.name}.lock")
 
 
 def discard(path: str | os.PathLike[str]) -> None:
@@ -133,10 +171,12 @@ def discard(path: str | os.PathLike[str]) -> None:
 
 
 def _remove_stale_temporaries(target: Path) -> None:
-    for left in target.parent.glob(f".{glob.escape(target.stem)}-{16 * '[0-9a-f]'}{glob.escape(target.suffix)}"):
-        with suppress(OSError), left.open("rb") as stream:  # locked, already gone, or of another user
-            fcntl.flock(stream, fcntl.LOCK_EX | fcntl.LOCK_NB)
-            left.unlink()
+    name = f".{glob.escape(target.stem)}-{16 * '[0-9a-f]'}{glob.escape(target.suffix)}"
+    locks = {*target.parent.glob(f"{name}.lock"), *map(_lock_of_temporary, target.parent.glob(name))}
+    for lock in locks:
+        with suppress(OSError, _HeldElsewhere), _locked(lock) as held:
+            if held:
+                lock.with_suffix("").unlink(missing_ok=True)
 
 
 def refuse_unwritable(path: str | os.PathLike[str]) -> None:

@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from ..errors import RequestError
+from ..errors import RequestError, pip_install
 from ..files.outputs import MARK
 from ..files.writing import whole_file
 from ..surface.heightfield import HeightField
@@ -86,7 +86,7 @@ def check_gds(levels: int | None) -> tuple[Any, int]:
     try:
         import gdstk
     except ModuleNotFoundError:
-        raise RequestError("--export gds: gdstk is not installed; pip install 'mitsuba_diffraction[gds]'") from None
+        raise RequestError(f"--export gds: gdstk is not installed; {pip_install('gds')}") from None
     return gdstk, levels
 
 

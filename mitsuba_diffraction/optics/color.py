@@ -18,7 +18,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from ..errors import RequestError
+from ..errors import RequestError, pip_install
 from ..settings import VISIBLE
 
 _D65 = (0.3127, 0.3290)  # x and y
@@ -361,7 +361,7 @@ def ocio_view(name: str) -> ViewTransform:
     try:
         import PyOpenColorIO as ocio
     except ModuleNotFoundError:
-        raise RequestError("--view: opencolorio is not installed; pip install 'mitsuba_diffraction[ocio]'") from None
+        raise RequestError(f"--view: opencolorio is not installed; {pip_install('ocio')}") from None
     source = os.environ.get("OCIO") or "ocio://default"
     try:
         config = ocio.Config.CreateFromFile(source)

@@ -21,7 +21,7 @@ import mitsuba as mi
 import numpy as np
 from numpy.typing import NDArray
 
-from ..errors import RequestError
+from ..errors import RequestError, pip_install
 from .film import LightOfBands
 from .parsed_scene import scene_digest
 from .passes import Job, Tracer, trace_band, versions
@@ -48,9 +48,7 @@ def trace_on(address: str) -> Tracer:
     try:
         import distributed
     except ImportError:
-        raise RuntimeError(
-            "a Dask cluster needs the package distributed: pip install 'mitsuba_diffraction[cluster]'"
-        ) from None
+        raise RuntimeError(f"a Dask cluster needs the package distributed: {pip_install('cluster')}") from None
 
     def trace(job: Job, scene: mi.Scene, first: int) -> Generator[NDArray[np.float32], None, None]:
         try:

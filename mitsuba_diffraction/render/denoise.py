@@ -18,7 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import fft
 
-from ..errors import RequestError
+from ..errors import RequestError, pip_install
 from ..optics.color import SRGB_TO_XYZ
 from .film import Rows
 from .spectral_image import split_rows
@@ -66,7 +66,7 @@ def check_requirements() -> None:
     try:
         import pyoidn  # noqa: F401
     except ModuleNotFoundError:
-        raise RequestError("--denoise: pyoidn is not installed; pip install 'mitsuba_diffraction[denoise]'") from None
+        raise RequestError(f"--denoise: pyoidn is not installed; {pip_install('denoise')}") from None
 
 
 def guides(scene: mi.Scene, band: Rows | None = None) -> Guides:

@@ -648,6 +648,7 @@ def test_an_interrupt_during_an_import_waits_for_its_end(monkeypatch):
 
 
 @pytest.mark.slow
+@pytest.mark.posix("SIGINT to one process")
 @pytest.mark.parametrize("seconds", [0.5, 1.0, 2.0, 3.0, 4.0, 6.0])
 def test_an_interrupt_at_any_time_is_one_line(seconds):
     Path("scene.xml").write_text(SCENE)

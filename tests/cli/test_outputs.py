@@ -3,11 +3,9 @@
 import functools
 import json
 import os
-import resource
-import signal
 import subprocess
 import sys
-from contextlib import contextmanager
+from contextlib import contextmanager, nullcontext
 from pathlib import Path
 
 import numpy as np
@@ -15,7 +13,7 @@ import pytest
 from PIL import Image
 
 import mitsuba_diffraction as md
-from mitsuba_diffraction.files import outputs
+from mitsuba_diffraction.files import outputs, writing
 from mitsuba_diffraction.files.outputs import check_outputs
 from mitsuba_diffraction.files.writing import is_intact, refuse_unwritable, seal, whole_file
 from mitsuba_diffraction.inverse_design import Design, makers, output
@@ -98,6 +96,7 @@ def test_a_scene_names_files(folder):
     assert named == {"u.xml", "scan.toml", "scan.png", "tex.png", "lights/sky.xml"}
 
 
+@pytest.mark.posix("symbolic links without a privilege")
 @pytest.mark.parametrize(
     ("line", "name"),
     [
@@ -277,7 +276,11 @@ def write_elsewhere(letter):
 
 
 def temporaries():
-    return [path for path in Path().iterdir() if path.name.startswith(".target-")]
+    return [path for path in Path().iterdir() if path.name.startswith(".target-") and path.suffix != ".lock"]
+
+
+def locks():
+    return list(Path().glob(".*.lock"))
 
 
 def test_two_processes_can_write_one_file():
@@ -290,16 +293,42 @@ def test_two_processes_can_write_one_file():
             writer.communicate("\n")
             assert writer.returncode == 0
             assert Path("target.bin").read_bytes() == letter * 100_000
-    assert not temporaries()
+    assert not temporaries() + locks()
 
 
 def test_temporary_files_of_a_killed_process_are_removed():
     with write_elsewhere("a") as process:
-        process.send_signal(signal.SIGKILL)
+        process.kill()
     Path(".target-of-mine.bin").write_text("mine")
+    left = f".target-{16 * 'a'}.bin.lock"  # killed before it wrote, or after the rename
+    Path(left).touch()
     assert len(temporaries()) == 2
+    assert len(locks()) == 2
     refuse_unwritable("target.bin")
     assert [path.name for path in temporaries()] == [".target-of-mine.bin"]
+    assert not locks()
+
+
+@pytest.mark.parametrize(("tries", "written"), [(3, "new"), (1000, "old")])
+def test_a_file_that_a_program_of_windows_has_open_is_tried_for_a_second(monkeypatch, tries, written):
+    failures, rename, slept = iter(range(tries)), os.replace, []
+
+    def replace(source, target):
+        if next(failures, None) is not None:
+            error = PermissionError(13, "Access is denied", source)
+            error.winerror = 5
+            raise error
+        rename(source, target)
+
+    Path("a.txt").write_text("old")
+    monkeypatch.setattr(os, "replace", replace)
+    monkeypatch.setattr(writing.time, "sleep", slept.append)
+    told = pytest.raises(PermissionError, match=r"another program has it open.*a\.txt") if tries > 3 else nullcontext()
+    with told, whole_file("a.txt") as temporary:
+        temporary.write_text("new")
+    assert Path("a.txt").read_text() == written
+    assert sum(slept) <= 1
+    assert not list(Path().glob(".a*"))
 
 
 def test_a_temporary_path_may_be_handed_on():
@@ -322,6 +351,7 @@ def test_a_seal_covers_every_byte():
 # --- files that are none, and names that are no text ---
 
 
+@pytest.mark.posix("named pipes and devices")
 @pytest.mark.parametrize("line", ["precompute NAME.npy --pixel-size 1", "inspect NAME.npy", "precompute NAME.toml"])
 @pytest.mark.parametrize("kind", ["pipe", "device"])
 def test_pipes_and_devices_are_refused(command, line, kind):
@@ -336,6 +366,7 @@ def test_pipes_and_devices_are_refused(command, line, kind):
     assert "a pipe or a device" in err
 
 
+@pytest.mark.posix("named pipes")
 def test_a_recipe_whose_scan_is_a_pipe_is_refused():
     os.mkfifo("pipe.png")
     Path("scan.toml").write_text(SCAN.replace("scan.png", "pipe.png"))
@@ -377,20 +408,17 @@ WRITERS = {
 }
 
 
+@pytest.mark.posix("limits of a process")
 @pytest.mark.parametrize("name", WRITERS)
-def test_a_full_disk_leaves_no_part_of_a_file(name):
+def test_a_full_disk_leaves_no_part_of_a_file(name, full_disk):
     """The limit is the size of the file; at a limit below it, libraries may lose the end of a file in silence."""
     Image.fromarray((255 * noise(40, 40, 3)).astype(np.uint8)).save("frame.png")
     whole = Path("whole") / name
     whole.parent.mkdir()
     WRITERS[name](whole)
-    size, (soft, hard) = whole.stat().st_size, resource.getrlimit(resource.RLIMIT_FSIZE)
+    size = whole.stat().st_size
     Path("part").mkdir()
     for limit in (size - 1, size - 100, size // 2, 10):
-        resource.setrlimit(resource.RLIMIT_FSIZE, (limit, hard))
-        try:
-            with pytest.raises((OSError, RuntimeError)):
-                WRITERS[name](Path("part") / name)
-        finally:
-            resource.setrlimit(resource.RLIMIT_FSIZE, (soft, hard))
+        with full_disk(limit), pytest.raises((OSError, RuntimeError)):
+            WRITERS[name](Path("part") / name)
         assert list(Path("part").iterdir()) == []

@@ -588,6 +588,7 @@ def test_the_command_takes_the_same_options_of_a_scan(tmp_path, command, monkeyp
 
 
 @pytest.mark.few(1)
+@pytest.mark.posix("symbolic links without a privilege")
 @pytest.mark.parametrize("damage", ["folder", "dangling link", "folder is a file", "folder is a dangling link"])
 def test_without_a_cache_there_is_a_warning(own_cache, builds, damage):
     # Regression: the render was refused.

@@ -227,6 +227,7 @@ def test_a_killed_scheduler_is_one_line():
 
 
 @pytest.mark.slow
+@pytest.mark.posix("SIGKILL")
 @pytest.mark.parametrize("processes", [2], indirect=True)
 def test_the_passes_of_a_lost_worker_are_traced_again(processes):
     here = render("scene.xml", spp=60)

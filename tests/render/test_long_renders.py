@@ -4,7 +4,6 @@ import importlib
 import itertools
 import os
 import re
-import resource
 import signal
 import subprocess
 import sys
@@ -326,6 +325,7 @@ def test_no_changed_bit_of_a_checkpoint_is_unnoticed():
 
 
 @pytest.mark.slow
+@pytest.mark.posix("SIGKILL")
 @pytest.mark.parametrize(
     ("kills", "rfilter"),
     [(2, "box"), (10, "box"), (10, "gaussian")],
@@ -496,15 +496,11 @@ def test_an_interrupt_before_the_first_pass_writes_nothing(command, monkeypatch)
 
 
 @pytest.mark.slow
-def test_a_full_disk_is_one_line_and_keeps_the_last_checkpoint(command, monkeypatch):
+@pytest.mark.posix("limits of a process")
+def test_a_full_disk_is_one_line_and_keeps_the_last_checkpoint(command, monkeypatch, full_disk):
     def limited(line):
-        # Not even the superuser writes more than this; a disk that is full raises another number.
-        soft, hard = resource.getrlimit(resource.RLIMIT_FSIZE)
-        resource.setrlimit(resource.RLIMIT_FSIZE, (100_000, hard))
-        try:
+        with full_disk(100_000):  # a disk that is full raises another number
             return command(line)
-        finally:
-            resource.setrlimit(resource.RLIMIT_FSIZE, (soft, hard))
 
     line = f"{LINE} --checkpoint 0"
     code, out, err = limited(line)
@@ -552,6 +548,7 @@ def test_a_disk_that_the_picture_fills_is_one_line(command, small_disk, monkeypa
     assert not list(small_disk.iterdir())
 
 
+@pytest.mark.posix("permissions of a folder")
 def test_a_folder_that_cannot_be_written_to_is_refused_before_the_work(command, monkeypatch):
     monkeypatch.setattr(passes, "trace_pass", None)
     place = Path("closed")

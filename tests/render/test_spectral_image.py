@@ -209,7 +209,7 @@ def test_whole_file_refuses_a_folder_and_a_missing_folder(tmp_path):
         pass
 
 
-@pytest.mark.skipif(os.name == "nt", reason="symbolic links need a privilege on Windows")
+@pytest.mark.posix("symbolic links without a privilege")
 def test_whole_file_follows_links(tmp_path):
     (tmp_path / "target.txt").write_text("old")
     (tmp_path / "link.txt").symlink_to("target.txt")

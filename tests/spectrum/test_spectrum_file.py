@@ -3,7 +3,6 @@
 import dataclasses
 import functools
 import os
-import resource
 import sys
 from concurrent.futures import ThreadPoolExecutor
 
@@ -387,18 +386,14 @@ def test_a_save_that_fails_leaves_the_old_file(saved, monkeypatch, error):
     assert [path.name for path in saved[1].parent.iterdir()] == ["saved.exr"]
 
 
-def test_a_disk_that_is_full_leaves_the_old_file(tmp_path):
+@pytest.mark.posix("limits of a process")
+def test_a_disk_that_is_full_leaves_the_old_file(tmp_path, full_disk):
     path = tmp_path / "saved.exr"
     make().save(path)
     before = path.read_bytes()
     large = make((65, 65), 1.0, tolerance=1e-2)
-    soft, hard = resource.getrlimit(resource.RLIMIT_FSIZE)
-    resource.setrlimit(resource.RLIMIT_FSIZE, (20_000, hard))
-    try:
-        with pytest.raises((OSError, RuntimeError)):
-            large.save(path)
-    finally:
-        resource.setrlimit(resource.RLIMIT_FSIZE, (soft, hard))
+    with full_disk(20_000), pytest.raises((OSError, RuntimeError)):
+        large.save(path)
     assert path.read_bytes() == before
     assert [entry.name for entry in tmp_path.iterdir()] == ["saved.exr"]
 

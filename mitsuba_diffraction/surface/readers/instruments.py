@@ -16,11 +16,11 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from ...errors import RequestError
+from ...errors import RequestError, pip_install
 from . import scan, workarounds
 from .scan import MAX_ARRAY_BYTES, Channel, Scan, choose_channel
 
-EXTRA = "pip install 'mitsuba_diffraction[instruments]'"
+EXTRA = pip_install("instruments")
 
 # Formats that SurfaceTopography names by their extension, and others.
 _NAMED_ALIKE = (
