@@ -2,9 +2,13 @@
 
 from __future__ import annotations
 
+import codecs
+import io
 import math
+import sys
 import threading
 import time
+import unicodedata
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import contextmanager
 
@@ -32,6 +36,8 @@ err = Console(stderr=True, highlight=False, soft_wrap=True)
 MIN_REPORTED_SECONDS = 2.0  # of work before a log or a notebook shows progress
 _MIN_REPORTED_DURATION = 10.0  # s, of a command
 _UNITS_OF_BYTES = ("GB", 1e9), ("MB", 1e6), ("kB", 1e3)
+_IN_ASCII = {"−": "-", "–": "-", "→": "->", "≤": "<=", "≥": ">=", "±": "+-", "×": "x", "·": "*"}
+_IN_ASCII |= {"µ": "u", "°": " deg", "²": "^2", "…": "...", "λ": "lambda"}  # Unicode names λ a lamda
 _lock = threading.Lock()
 _stages: list[str] = []  # nested blocks of code, the innermost last
 _durations: dict[str, float] = {}  # s, by the name of a stage
@@ -94,6 +100,26 @@ def _after(unit: str, depth: int) -> str:
     """Return the unit and the stage, if one began inside the `depth` stages around a bar."""
     doing = _stages[depth:]
     return ", ".join([*([unit] if unit else []), *doing[-1:]])
+
+
+def adapt_streams() -> None:
+    """Print in words or escapes what the encoding of stdout and stderr lacks, as that of a pipe on Windows."""
+    codecs.register_error("in_words", _in_words)
+    for stream in (sys.stdout, sys.stderr):
+        if isinstance(stream, io.TextIOWrapper):
+            stream.reconfigure(errors="in_words")
+
+
+def _in_words(error: UnicodeError) -> tuple[str | bytes, int]:
+    """Return lambda for λ, - for −, and so on; an escape for other characters, such as in file names."""
+    assert isinstance(error, UnicodeEncodeError)
+    character = error.object[error.start]
+    if (text := _IN_ASCII.get(character)) is None:
+        kind, _, letter = unicodedata.name(character, "").partition(" LETTER ")
+        if kind not in ("GREEK SMALL", "GREEK CAPITAL") or " " in letter:
+            return codecs.backslashreplace_errors(error)
+        text = letter.lower() if kind == "GREEK SMALL" else letter.capitalize()
+    return text, error.start + 1
 
 
 def say(kind: str, message: object) -> None:

@@ -233,6 +233,22 @@ def test_models_are_made_when_a_scene_is_first_read(tmp_path, monkeypatch):
         parsed_scene.files_of_scene(scene)
 
 
+def test_load_file_makes_models_too(tmp_path, monkeypatch, llvm):
+    for folder in ("package/scenes", "scenes"):
+        (tmp_path / folder).mkdir(parents=True)
+    maker = "from PIL import Image\ndef make(folder):\n    Image.new('L', (2, 2)).save(folder / 'a.png')\n"
+    (tmp_path / "package" / "scenes" / "disc.py").write_text(maker)
+    monkeypatch.setattr(parsed_scene, "examples_folder", lambda: tmp_path / "package")
+    texture = '<texture type="bitmap" id="t"><string name="filename" value="models/$name.png"/></texture>'
+    scene = tmp_path / "scenes" / "scene.xml"
+    scene.write_text(f'<scene version="3.0.0"><!-- made by: python scenes/disc.py -->{texture}</scene>')
+    assert isinstance(mi.load_file(str(scene), parallel=False, name="a"), mi.Scene)
+    assert (tmp_path / "scenes" / "models" / "a.png").is_file()
+    with pytest.raises(RuntimeError, match=r"models/b.png: no such file; it is made by: python scenes/disc.py"):
+        mi.load_file(str(scene), name="b")
+
+
+@pytest.mark.posix("symbolic links without a privilege")
 def test_a_scene_names_every_script_that_makes_its_files(tmp_path, monkeypatch):
     shutil.copytree(SCENES, tmp_path / "scenes", ignore=shutil.ignore_patterns("models", "out", "gallery.npz"))
     (tmp_path / "precompute").symlink_to(ROOT / "precompute")

@@ -7,7 +7,6 @@ from __future__ import annotations
 
 import _thread
 import importlib
-import io
 import logging
 import signal
 import sys
@@ -22,7 +21,7 @@ import typer
 from typer.core import TyperCommand
 
 from ..errors import Bug, RequestError, is_bug
-from ..progress import NAME, say, tell
+from ..progress import NAME, adapt_streams, say, tell
 from .design import design
 from .efficiency import efficiency
 from .examples import examples
@@ -111,9 +110,7 @@ class _Log(logging.Handler):
 
 def main() -> None:
     """Run `mitsuba-diffraction`: parse the arguments, run the command, report errors and exit."""
-    for stream in (sys.stdout, sys.stderr):
-        if isinstance(stream, io.TextIOWrapper):  # neither file names nor terminals need be UTF-8
-            stream.reconfigure(errors="backslashreplace")
+    adapt_streams()
     warnings.showwarning = lambda message, *args, **kwargs: say("warning", message)
     log, logger = _Log(), logging.getLogger(__package__.partition(".")[0])
     logger.addHandler(log)

@@ -1,6 +1,7 @@
 """The functions of Mitsuba that the package wraps: `load_dict`, `load_file`, `load_string` and `render`.
 
-A scene that is loaded covers the light of its gratings or is refused in one line, and no garbage is collected while a
+A scene that is loaded covers the light of its gratings or is refused in one line, models of the package's scenes are
+made when they are first loaded, and no garbage is collected while a
 picture is traced.
 """
 
@@ -9,8 +10,10 @@ from __future__ import annotations
 import contextlib
 import functools
 import gc
+import os
 import threading
 from collections.abc import Callable, Collection, Iterator
+from pathlib import Path
 
 import mitsuba as mi
 
@@ -24,6 +27,7 @@ making = threading.Lock()
 
 def wrap_functions(plugins: Collection[str]) -> None:
     """Replace the functions of Mitsuba; `plugins` are the names whose errors are reported in one line."""
+    mi.load_file = _with_models(mi.load_file)
     for name in ("load_dict", "load_file", "load_string"):
         setattr(mi, name, _with_short_errors(getattr(mi, name), plugins))
     mi.render = _with_light_covered(mi.render)
@@ -49,6 +53,22 @@ def _with_short_errors(load: Callable[..., mi.Object], plugins: Collection[str])
             except Bug:
                 raise error from None  # with its traceback
         raise RuntimeError(line)
+
+    return loader
+
+
+def _with_models(load: Callable[..., mi.Object]) -> Callable[..., mi.Object]:
+    """Return `load_file`, which first makes the models of the package's scenes, as the command `render` does."""
+
+    @functools.wraps(load)
+    def loader(path: str, *args: object, **kwargs: object) -> mi.Object:
+        if os.path.isfile(path) and b"made by:" in Path(path).read_bytes():
+            from ..render.parsed_scene import parsed
+
+            own = ("parallel", "optimize")
+            with parsed(path, {name: str(value) for name, value in kwargs.items() if name not in own}):
+                pass  # made while it is parsed
+        return load(path, *args, **kwargs)
 
     return loader
 

@@ -143,7 +143,7 @@ def check_memory(scene: mi.Scene, spp: int, bands: tuple[Rows, ...] | None = Non
 def available_memory() -> int | None:
     """Return the number of bytes that processes can allocate, swap included; None if unknown."""
     try:
-        entries = dict(line.split(":") for line in Path("/proc/meminfo").read_text().splitlines())
+        entries = dict(line.split(":") for line in Path("/proc/meminfo").read_text("ascii").splitlines())
         return 1024 * sum(int(entries[name].split()[0]) for name in ("MemAvailable", "SwapFree"))
     except (OSError, KeyError, ValueError):
         return None

@@ -149,9 +149,10 @@ def _make_models(scripts: list[str], folder: Path) -> None:
             # Without the current folder, whose modules are the user's.
             program = f"import sys; sys.path[:] = [sys.argv[1], *filter(None, sys.path)]; import pathlib, {script}\n"
             program += f"{script}.make(pathlib.Path(sys.argv[2]))"
-            done = subprocess.run([sys.executable, "-c", program, str(scenes), made], capture_output=True, text=True)
+            done = subprocess.run([sys.executable, "-c", program, str(scenes), made], capture_output=True)
             if done.returncode:
-                raise RuntimeError(f"models: {script}.py failed ({' '.join(done.stderr.split()[-30:])})")
+                last = " ".join(done.stderr.decode(errors="replace").split()[-30:])
+                raise RuntimeError(f"models: {script}.py failed ({last})")
             folder.mkdir(exist_ok=True)
             for file in Path(made).iterdir():
                 if not (folder / file.name).exists():
