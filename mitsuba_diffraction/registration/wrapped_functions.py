@@ -1,8 +1,7 @@
 """The functions of Mitsuba that the package wraps: `load_dict`, `load_file`, `load_string` and `render`.
 
 A scene that is loaded covers the light of its gratings or is refused in one line, models of the package's scenes are
-made when they are first loaded, and no garbage is collected while a
-picture is traced.
+made when they are first loaded, and no garbage is collected while a picture is traced.
 """
 
 from __future__ import annotations
