@@ -13,6 +13,13 @@ function contextOf(canvas) {
   return gl;
 }
 
+// Whether the processor draws: software renderers of browsers have these names.
+function hasNoGPU(gl) {
+  const info = gl.getExtension("WEBGL_debug_renderer_info");
+  const name = gl.getParameter(info ? info.UNMASKED_RENDERER_WEBGL : gl.RENDERER);
+  return /swiftshader|llvmpipe|softpipe|software/i.test(name);
+}
+
 class Program {
   constructor(gl, vertex, ...fragment) {
     this.gl = gl;

@@ -270,7 +270,10 @@ function showTimes(renderer, state) {
   const drawing = Boolean(renderer.shader) && renderer.shader.frame === 0;
   $("drawing").hidden = !drawing;
   showLamp(state, renderer.width, renderer.height);
-  const texts = [`This model: ${of(renderer.model)} a frame; ${renderer.model.frame} of ${state.maxFrames} frames.`];
+  const texts = [
+    ...(hasNoGPU(renderer.gl) ? ["This browser has no GPU: the processor draws, in seconds a frame."] : []),
+    `This model: ${of(renderer.model)} a frame; ${renderer.model.frame} of ${state.maxFrames} frames.`,
+  ];
   if (renderer.shader) texts.push(`Shader of 2014: ${of(renderer.shader)} a frame; ${renderer.shader.frame} averaged.`);
   $("times").textContent = texts.join(" ");
 }

@@ -2,6 +2,17 @@
 
 const DARK = 1e-6;  // f cos theta, 1/sr, of what no eye sees
 
+// XYZ under the light of the page of values at equidistant wavelengths, [nm, value].
+function coloursOf(values) {
+  const step = values[1][0] - values[0][0];
+  const sum = [0, 0, 0];
+  for (const [nm, value] of values) {
+    const i = 4 * (nm - 360);
+    for (let k = 0; k < 3; k++) sum[k] += step * value * matching[i + 3] * matching[i + k];
+  }
+  return sum;
+}
+
 class Picker {
   constructor(renderer, state) {
     Object.assign(this, { renderer, state });
@@ -31,8 +42,11 @@ class Picker {
     const axes = [sum(scaled(s, Math.cos(turn)), scaled(t, Math.sin(turn))), sum(scaled(t, Math.cos(turn)), scaled(s, -Math.sin(turn))), n];
     const local = (v) => axes.map((axis) => dot(axis, v));
     const mean = renderer.model.mean.read(...at, 1, 1);
-    const xyz = [...mean.slice(0, 3)].map((value) => value / (mean[3] || 1));
-    return { wi: local(towardsLight(state)), wo: local(outgoingAt(state, camera, position.slice(0, 3))), xyz };
+    return {
+      wi: local(towardsLight(state)),
+      wo: local(outgoingAt(state, camera, position.slice(0, 3))),
+      luminance: mean[1] / (mean[3] || 1),  // of the pixel, with all of the lamp and the sky
+    };
   }
 
   // f cos theta_i from 380 to 740 nm, in steps of 2 nm, of parallel light.
@@ -74,7 +88,11 @@ class Picker {
     if (!found) return null;
     const values = this.spectrumOf(found);
     const orders = this.ordersOf(found);
-    const rgb = toRGB(found.xyz);
+    const xyz = coloursOf(values);
+    const rgb = toRGB(xyz);
+    const hex = `#${this.renderer.displayed(xyz).map((c) => Math.round(255 * c).toString(16).padStart(2, "0")).join("")}`;
+    $("swatch").hidden = !(xyz[1] > 0);
+    $("swatch").style.background = hex;
     const angle = (v) => `${((Math.acos(Math.min(Math.max(v[2], -1), 1)) * 180) / Math.PI).toFixed(1)}°`;
     const isLine = this.renderer.data.spectrum.max_order[1] === 0;
     const named = orders.map(({ order, nanometres }) =>
@@ -82,12 +100,12 @@ class Picker {
     const digits = (v) => v.map((x) => x.toPrecision(3)).join(", ");
     $("picked-text").textContent = [
       `Light at ${angle(found.wi)}, eye at ${angle(found.wo)} from the normal.`,
-      this.remark(values, found.xyz[1]),
+      this.remark(values, found.luminance),
       named.length ? `Orders, by the grating equation: ${named.join("; ")}.` : "",
-      `XYZ ${digits(found.xyz)}; linear sRGB ${digits(rgb)}.`,
+      `Curve in daylight: ${xyz[1] > 0 ? `${hex}, ` : ""}XYZ ${digits(xyz)}; linear sRGB ${digits(rgb)}.`,
     ].join(" ");
     this.plot(values, orders);
-    return { ...found, values, orders, rgb };
+    return { ...found, values, orders, xyz, rgb, hex };
   }
 
   // What a dark spectrum beside a colour means: it is that of the middle of the lamp alone.

@@ -12,6 +12,8 @@ const int POINTS = KIND != RESOLVED ? 16 : LIGHT == 0 ? 1 : 4, EACH = 3;
 
 mat3 lightAxes;  // along them: half the width, half the length, and the direction of the light
 vec4 random;     // of this pixel and frame
+int tilePlace = 0;  // of this pixel among those that share the points of a frame
+const vec4 STEPS = vec4(0.8566748838545, 0.7338918566271, 0.6287067210378, 0.5385972572236);  // from point to point (Roberts 2018)
 vec4 lightAt(int n);
 vec4 lightTo(vec2 place);
 
@@ -31,7 +33,7 @@ vec3 overWavelengths(vec3 wi, vec3 wo, int point) {
   float factor = steep ? steepFactor(wi, wo, tangent) * plane : plane, perFrequency = intervalsOf(wi, wo, 1.0);
   vec3 result = vec3(0.0);
   for (int k = 0; k < EACH; k++) {
-    int j = point + k * POINTS;
+    int j = (point + tilePlace) % POINTS + k * POINTS;  // in a tile, each point of the light meets all wavelengths
     vec4 weights = uSpectrum[j];
     float lambda = 1e-3 * weights.w, frequency = 1.0 / lambda, value;
     if (!steep) value = scatter(wi, wo, lambda);
@@ -97,7 +99,7 @@ vec3 overOrders(vec3 wi, vec3 wo, vec2 u) {
 vec4 lightFor(int n, vec3 wo) {
   int across = uMaxOrder.x == 0 ? 0 : 1;
   if (KIND != RESOLVED || LIGHT != 2 || uMaxOrder[across] != 0) return lightAt(n);
-  vec2 u = fract(random.xy + float(n) * vec2(0.8566748838545, 0.7338918566271));
+  vec2 u = fract(random.xy + float(n) * STEPS.xy);
   float x = 2.0 * u.x - 1.0, y = 0.0, slope;
   // v = 0 by Newton's method.
   for (int k = 0; k < 3; k++) {
@@ -125,7 +127,7 @@ vec3 ofSky(vec3 wo, float transmitted) {
   int width = textureSize(uNodes, 0).x, columns = 2 * uMaxOrder.x + 1;
   vec3 result = vec3(0.0);
   for (int k = 0; k < SAMPLES; k++) {
-    vec4 u = fract(random.wzyx + float(k) * vec4(0.8566748838545, 0.7338918566271, 0.6287067210378, 0.5385972572236));
+    vec4 u = fract(random + 0.5 + float(k) * STEPS);
     if (HAS_BASE) {
       vec3 diffuse = vec3(sqrt(u.z) * vec2(cos(2.0 * PI * u.w), sin(2.0 * PI * u.w)), sqrt(1.0 - u.z));
       result += facing(diffuse) * skyIn(diffuse) * transmitted * transmittance(diffuse.z) * uPigmentColour;
@@ -170,7 +172,7 @@ vec3 radiance(vec3 wo) {
     if (wi.z <= 0.0 || light.w <= 0.0) continue;
     vec3 value = vec3(0.0);
     if (covered(wi, wo)) {
-      value = KIND == RESOLVED ? overOrders(wi, wo, fract(random.zw + float(n) * vec2(0.6287067210378, 0.5385972572236)))
+      value = KIND == RESOLVED ? overOrders(wi, wo, fract(random.zw + float(n) * STEPS.zw))
                                 : overWavelengths(wi, wo, n);
       value *= (1.0 - face(wi.z)) * (1.0 - face(wo.z));
     }

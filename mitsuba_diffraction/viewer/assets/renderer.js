@@ -4,8 +4,11 @@ const GOLDEN = 0.6180339887498949;
 const R2 = [0.7548776662466927, 0.5698402909980532];  // steps of a two-dimensional sequence (Roberts 2018)
 const R4 = [0.8566748838545029, 0.733891856627126, 0.6287067210378087, 0.5385972572236101];  // of a four-dimensional one
 const POINTS = 4;  // of the light in a frame of resolved orders, at most
+const TILE_POINTS = 256;  // of a tile of 4 x 4 pixels in a frame, see shade.glsl
+const SMOOTH_FRAMES = 16;  // the first ones, which are shown smoothed over a tile, the last of them less and less
 // Where the sequences of a frame begin, so that its points follow those of the frame before.
-const randomOf = (frame) => R4.map((step) => fraction(0.5 + POINTS * frame * step));
+const randomOf = (frame, points) => R4.map((step) => fraction(0.5 + points * frame * step));
+const smoothingOf = (frame) => Math.min(Math.max(2 - (2 * frame) / SMOOTH_FRAMES, 0), 1);
 const fraction = (x) => x - Math.floor(x);
 
 // One of the two shaders: its program, its uniforms, and the mean of its frames. A frame is drawn in bands of rows, so
@@ -195,7 +198,7 @@ class Renderer {
       uLight: towardsLight(state),
       uPlate: plateOf(state),
       uLightSize: lightSizeOf(state).uLightSize,
-      uRandom: randomOf(frame),
+      uRandom: randomOf(frame, TILE_POINTS),
       uSin: Math.sin(turn),
       uCos: Math.cos(turn),
     });
@@ -234,6 +237,8 @@ class Renderer {
     this.screen.use({
       uMean: this.model.mean.textures[0],
       uOther: other,
+      uSmooth: smoothingOf(this.model.frame),
+      uOtherSmooth: isPicture ? 0 : smoothingOf((this.shader || this.model).frame),
       uScale: this.scale,
       uOtherScale: isPicture ? pictureScale(picture, width, height) : [this.scale, this.scale, 0, 0],
       uOtherIsPicture: Number(isPicture),
@@ -244,6 +249,22 @@ class Renderer {
       uBackground: background,
     });
     this.quad();
+  }
+
+  // Encoded sRGB of XYZ as it is shown where its brightest channel is at the shoulder, 0 to 1.
+  displayed(xyz) {
+    const { gl } = this;
+    const target = new Target(gl, 1, 1);
+    target.bind();
+    const uMean = numbers2D(gl, Float32Array.from([...xyz, 1]), 1, 1, 4);
+    this.screen.use({
+      uMean, uOther: uMean, uSmooth: 0, uOtherSmooth: 0, uScale: 1, uOtherScale: [1, 1, 0, 0], uOtherIsPicture: 0,
+      uExposure: 0.8 / Math.max(...toRGB(xyz), 1e-30), uOtherExposure: 1, uDivider: 1e6, uDifference: 0, uBackground: [0, 0, 0],
+    });
+    this.quad();
+    const values = target.read(0, 0, 1, 1);
+    target.dispose();
+    return [...values.slice(0, 3)];
   }
 
   // XYZ and coverage of the mean of a side, from the lowest row up: (height, width, 4).
@@ -285,7 +306,7 @@ class Renderer {
     const program = this.programOf(state, SHADERS.radiance_model, SHADERS.pairs_model);
     const mean = new Float64Array((4 * pairs.length) / 7);
     for (let frame = 0; frame < frames; frame++) {
-      const values = this.evaluate(program, { ...this.modelUniforms(state, frame), uRandom: randomOf(frame) }, pairs);
+      const values = this.evaluate(program, { ...this.modelUniforms(state, frame), uRandom: randomOf(frame, POINTS) }, pairs);
       for (let i = 0; i < mean.length; i++) mean[i] += values[i] / frames;
     }
     return mean;

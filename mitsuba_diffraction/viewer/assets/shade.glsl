@@ -13,12 +13,6 @@ uniform float uSin;                 // of the angle from the tangent to the patt
 uniform float uCos;
 out vec4 oMean;
 
-float hash(uvec2 at) {
-  uint h = at.x * 1664525u + at.y * 1013904223u;
-  h ^= h >> 16; h *= 2246822519u; h ^= h >> 13; h *= 3266489917u; h ^= h >> 16;
-  return float(h) / 4294967296.0;
-}
-
 // omega_i of a point of the light, -1 to 1 along its axes; w is the solid angle of the elements there relative to the
 // middle.
 vec4 lightTo(vec2 place) {
@@ -30,7 +24,7 @@ vec4 lightTo(vec2 place) {
 // The n-th point of the light, a disc or a strip along the meridian.
 vec4 lightAt(int n) {
   if (LIGHT == 0) return vec4(lightAxes[2], 1.0);
-  vec2 u = fract(random.xy + float(n) * vec2(0.8566748838545, 0.7338918566271));
+  vec2 u = fract(random.xy + float(n) * STEPS.xy);
   vec2 place = 2.0 * u - 1.0;
   if (LIGHT == 1) place = sqrt(u.x) * vec2(cos(6.28318531 * u.y), sin(6.28318531 * u.y));
   return lightTo(place);
@@ -63,7 +57,11 @@ void main() {
     facet.z = sqrt(1.0 - dot(facet, facet));
     vec3 width = normalize(cross(vec3(0.0, 0.0, 1.0), uLight));
     lightAxes = mat3(uLightSize.x * (width * frame), uLightSize.y * (cross(uLight, width) * frame), uLight * frame);
-    random = uRandom + vec4(hash(uvec2(at)), hash(uvec2(at) + 7919u), hash(uvec2(at) + 104729u), hash(uvec2(at) + 15485863u));
+    // Interleaved sampling (Keller and Heidrich 2001): the pixels of a tile of 4 x 4 share the points of a frame, the
+    // same ones in every tile, and means over 4 x 4 pixels (display.glsl) have no noise.
+    ivec2 row = at & 1, half_ = (at >> 1) & 1;
+    tilePlace = 4 * (2 * (row.x ^ row.y) + row.y) + 2 * (half_.x ^ half_.y) + half_.y;
+    random = fract(uRandom + float(16 * tilePlace) * STEPS);
     vec3 wo = normalize(uPlate > 0.0 ? position.xyz - vec3(0.0, 0.0, uPlate) : uEye - position.xyz) * frame;
     vec3 xyz = wo.z > 0.0 ? mirrored(wo) : vec3(0.0);
     if (position.w == 1.0) xyz += radiance(wo);
