@@ -263,7 +263,8 @@ class Layers:
         if base_context is not None and self.base is not None:
             rest = smaller((sample1 - p_grating) / (1 - p_grating), BELOW_ONE)
             base_sample, weight = self.base.bsdf.sample(base_context, si, rest, sample2, of_base)
-            bs.wo = dr.select(of_base, base_sample.wo, bs.wo)
+            # A sample that fails has no direction.
+            bs.wo = dr.select(of_base, dr.select(base_sample.pdf > 0, base_sample.wo, 0), bs.wo)
             bs.sampled_type = dr.select(of_base, base_sample.sampled_type, bs.sampled_type)
             bs.sampled_component = dr.select(of_base, base_sample.sampled_component + 1, 0)
         value, bs.pdf = self.evaluate(ctx, si, bs.wo, active, wo_is_sample=True)

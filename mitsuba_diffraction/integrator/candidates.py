@@ -23,14 +23,16 @@ kept. Their light, and the path, are continued by an ordinary sample (`EyePaths`
 
 from __future__ import annotations
 
+import functools
+
 import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from ..bsdf.base import gratings_in
+from ..bsdf.base import gratings_in, is_grating, parts
 from ..bsdf.device_tables import BELOW_ONE, opaque
+from ..precomputation.grating_spectrum import GratingSpectrum
 from ..precomputation.spectra import Spectrum
-from ..rigorous.rigorous_spectrum import RigorousSpectrum
 from ..spectrum.grids import OrderGrid
 from .unshadowed_light import UnshadowedLight
 
@@ -38,7 +40,7 @@ CANDIDATES = 16  # M
 SLOTS, SLOTS_OF_CONTINUA = 4, 1  # J
 DEFENSIVE_FRACTION = 0.1  # β
 MIN_GAIN = 6.0  # of h by light samples over that in all directions, from which candidates are drawn
-MIN_SEPARATION = 4.0  # of orders, in standard deviations of their lobes, from which each wavelength has its own slot
+MAX_NARROW_LOBE = 0.05  # σ_q in cycles/µm, up to which each wavelength has its own slot
 _DIRECTIONS = 2**15  # for this comparison
 # Of a lattice with low discrepancy in two dimensions: 1/g and 1/g², g³ = g + 1.
 _LATTICE = (0.7548776662466927, 0.5698402909980532)
@@ -49,17 +51,25 @@ class Candidates:
 
     Attributes:
         light: h.
+        any: whether candidates are drawn on any of the shapes.
     """
 
     def __init__(self, scene: mi.Scene, shapes: list[mi.Shape]) -> None:
         self.light = UnshadowedLight(scene)
-        slots = [self._slots(scene, shape) for shape in shapes]
-        self.any = any(slots)
+        slots = {shape: self._slots(scene, shape) for shape in shapes}
+        shapes = [shape for shape in shapes if slots[shape]]
+        self.any = bool(shapes)
+        self._bsdfs: list[mi.BSDF] = []
         ids = [dr.reinterpret_array(mi.UInt32, mi.ShapePtr(shape))[0] for shape in shapes]
         self._size = dr.opaque(mi.UInt32, max(ids, default=0) + 1)
-        table = np.zeros(max(ids, default=0) + 1, np.uint32)
-        table[ids] = slots
-        self._table = mi.UInt32(table)
+        # Of each shape J, and the number of its BSDF.
+        table = np.zeros((max(ids, default=0) + 1, 2), np.uint32)
+        for shape, row in zip(shapes, ids, strict=True):
+            bsdf = shape.bsdf()
+            if not any(bsdf is known for known in self._bsdfs):
+                self._bsdfs.append(bsdf)
+            table[row] = slots[shape], next(k for k, known in enumerate(self._bsdfs) if bsdf is known)
+        self._table = mi.UInt32(table.ravel())
         self._count, self._fraction = dr.opaque(mi.UInt32, CANDIDATES), opaque(DEFENSIVE_FRACTION)
 
     def _slots(self, scene: mi.Scene, shape: mi.Shape) -> int:
@@ -81,13 +91,13 @@ class Candidates:
         )
         if float(of_lights[0]) < MIN_GAIN * float(dr.mean(self.light(at.p, anywhere, True))[0]):
             return 0
-        separate = all(_separates_orders(grating.spectrum) for grating in gratings_in(shape.bsdf()))
-        return SLOTS if separate else SLOTS_OF_CONTINUA
+        narrow = all(_has_narrow_lobes(grating.spectrum) for grating in gratings_in(shape.bsdf()))
+        return SLOTS if narrow else SLOTS_OF_CONTINUA
 
     def slots(self, si: mi.SurfaceInteraction3f, active: mi.Bool) -> mi.UInt32:
         """Return J at a point, zero where no candidates are drawn."""
         shape_id = dr.reinterpret_array(mi.UInt32, si.shape)
-        return dr.gather(mi.UInt32, self._table, shape_id, active & (shape_id < self._size))
+        return dr.gather(mi.UInt32, self._table, 2 * shape_id, active & (shape_id < self._size))
 
     def relative_density(self, slots: mi.UInt32) -> mi.Float:
         """Return c J."""
@@ -95,70 +105,91 @@ class Candidates:
 
     @dr.syntax
     def sample(
-        self,
-        scene: mi.Scene,
-        sampler: mi.Sampler,
-        si: mi.SurfaceInteraction3f,
-        bsdf: mi.BSDFPtr,
-        slots: mi.UInt32,
-        active: mi.Bool,
+        self, scene: mi.Scene, sampler: mi.Sampler, si: mi.SurfaceInteraction3f, slots: mi.UInt32, active: mi.Bool
     ) -> mi.Spectrum:
         """Return the light of all slots, the first sum above."""
-        ctx, result = mi.BSDFContext(), mi.Spectrum(0)
-        active = mi.Bool(active)
+        ctx, result, bsdf = mi.BSDFContext(), mi.Spectrum(0), si.bsdf()
         shift, jitter = sampler.next_2d(active), sampler.next_1d(active)
+        number = dr.gather(mi.UInt32, self._table, 2 * dr.reinterpret_array(mi.UInt32, si.shape) + 1, active)
         count, total = mi.Float(self._count), mi.Float(slots * self._count)
-        slot, number = mi.UInt32(0), mi.UInt32(0)
+        slot = mi.UInt32(0)
         while active & (slot < slots):
-            chosen, uniform = sampler.next_1d(active), sampler.next_1d(active)
-            is_uniform = sampler.next_1d(active) < self._fraction
-            pick = mi.UInt32(uniform * count)
-            omega, guess, sum_of_guesses = mi.Vector3f(0, 0, 1), mi.Float(0), mi.Float(0)
-            candidate = mi.UInt32(0)
-            while candidate < self._count:
-                u = dr.minimum((mi.Float(number) + jitter) / total, BELOW_ONE)
-                bs, _ = bsdf.sample(ctx, si, u, _lattice_point(number, shift), active)
-                usable = active & (bs.pdf > 0) & ~mi.has_flag(bs.sampled_type, mi.BSDFFlags.Delta)
-                h = dr.select(usable, self.light(si.p, si.to_world(bs.wo), usable), 0)
-                sum_of_guesses += h
-                # A single random number serves all decisions: given one of them, it is uniform after division.
-                takes = chosen * sum_of_guesses < h
-                rest = chosen * sum_of_guesses
-                rest = dr.select(takes, rest / h, (rest - h) / (sum_of_guesses - h))
-                chosen = dr.select(h > 0, rest, chosen)
-                takes = dr.select(is_uniform, candidate == pick, takes)
-                omega, guess = dr.select(takes, bs.wo, omega), dr.select(takes, h, guess)
-                candidate += 1
-                number += 1
-            fraction = guess / sum_of_guesses
-            weight = 1 / (dr.fma(count * fraction, 1 - self._fraction, self._fraction))
-            kept = active & (guess > 0)
+            pick = sampler.next_1d(active)
+            pick = dr.select(sampler.next_1d(active) < self._fraction, mi.UInt32(pick * count), self._count)
+            numbers = (mi.Float(slot * self._count) + jitter) / total, 1 / total, shift, sampler.next_1d(active), pick
+            omega, fraction = self._kept(number, si, numbers, active)
+            kept = active & (fraction > 0)
             value, pdf = bsdf.eval_pdf(ctx, si, omega, kept)
             kept &= dr.any(value != 0)
-            ray = si.spawn_ray(si.to_world(omega))
-            found = scene.ray_intersect(ray, kept)
+            found = scene.ray_intersect(si.spawn_ray(si.to_world(omega)), kept)
             ds = mi.DirectionSample3f(scene, found, si)
             pdf_emitter = scene.pdf_emitter_direction(si, ds, kept)
             emitted = ds.emitter.eval(found, kept)
-            weight *= count / dr.fma(total, pdf, pdf_emitter)
+            # c/(M π)
+            weight = count / dr.fma(count * fraction, 1 - self._fraction, self._fraction)
+            weight /= dr.fma(total, pdf, pdf_emitter)
             result += dr.select(kept, value * emitted * weight, 0)
             slot += 1
         return result
 
+    def _kept(
+        self, number: mi.UInt32, si: mi.SurfaceInteraction3f, numbers: tuple, active: mi.Bool
+    ) -> tuple[mi.Vector3f, mi.Float]:
+        """Return the candidate that is kept, and its h/Σ h; `number` is that of the BSDF in `_bsdfs`.
 
-def _lattice_point(number: mi.UInt32, shift: mi.Point2f) -> mi.Point2f:
+        `numbers` of a slot: the first number of `sample` for the first candidate, and its step; the shift of the
+        lattice; a random number for the choice by h; the candidate chosen without h, or M.
+
+        The BSDFs themselves are called, not `BSDFPtr`: then Dr.Jit leaves out what is computed besides the direction.
+        """
+        if len(self._bsdfs) == 1:
+            return self._kept_of(self._bsdfs[0], si, numbers, active)
+        return dr.switch(number, [functools.partial(self._kept_of, bsdf) for bsdf in self._bsdfs], si, numbers, active)
+
+    @dr.syntax
+    def _kept_of(
+        self, bsdf: mi.BSDF, si: mi.SurfaceInteraction3f, numbers: tuple, active: mi.Bool
+    ) -> tuple[mi.Vector3f, mi.Float]:
+        u, step, shift, chosen, pick = numbers
+        ctx, tells_failure = mi.BSDFContext(), _tells_failure(bsdf)
+        omega, guess, sum_of_guesses = mi.Vector3f(0, 0, 1), mi.Float(0), mi.Float(0)
+        candidate = mi.UInt32(0)
+        while candidate < self._count:
+            position = dr.minimum(dr.fma(mi.Float(candidate), step, u), BELOW_ONE)
+            bs, _ = bsdf.sample(ctx, si, position, _lattice_point(position / step, shift), active)
+            usable = active & ~mi.has_flag(bs.sampled_type, mi.BSDFFlags.Delta)
+            usable &= (bs.wo.z != 0) if dr.hint(tells_failure, mode="scalar") else (bs.pdf > 0)
+            h = dr.select(usable, self.light(si.p, si.to_world(bs.wo), usable), 0)
+            sum_of_guesses += h
+            # A single random number serves all decisions: given one of them, it is uniform after division.
+            scaled = chosen * sum_of_guesses
+            takes = scaled < h
+            scaled = dr.select(takes, scaled / h, (scaled - h) / (sum_of_guesses - h))
+            chosen = dr.select(h > 0, scaled, chosen)
+            takes = dr.select(pick < self._count, candidate == pick, takes)
+            omega, guess = dr.select(takes, bs.wo, omega), dr.select(takes, h, guess)
+            candidate += 1
+        return omega, dr.select(guess > 0, guess / sum_of_guesses, 0)
+
+
+def _tells_failure(bsdf: mi.BSDF) -> bool:
+    """Return whether `sample` of a BSDF returns a direction in the surface where it fails, so that `pdf` need not tell.
+
+    So do gratings, and BSDFs of Mitsuba that perturb or flip the frame.
+    """
+    nested = parts(bsdf, mi.BSDF)
+    if is_grating(bsdf):
+        return True
+    return bsdf.class_name() in ("TwoSidedBRDF", "NormalMap", "BumpMap") and all(map(_tells_failure, nested))
+
+
+def _lattice_point(number: mi.Float, shift: mi.Point2f) -> mi.Point2f:
     """Return a point of the lattice with a random shift, in the unit square."""
-    point = mi.Float(number) * mi.Point2f(_LATTICE) + shift
+    point = dr.floor(number) * mi.Point2f(_LATTICE) + shift
     return dr.minimum(point - dr.floor(point), BELOW_ONE)
 
 
-def _separates_orders(spectrum: Spectrum) -> bool:
-    """Return whether the wavelengths of a ray have lobes of their own: orders are separate along an axis at least."""
-    if isinstance(spectrum, RigorousSpectrum):
-        periods = [spectrum.axes.period]
-    elif isinstance(spectrum.grid, OrderGrid):
-        grid = spectrum.grid
-        periods = [period for period, m in zip(grid.tile_size, grid.max_order, strict=True) if m > 0]
-    else:
-        periods = []
-    return any(1 / period > MIN_SEPARATION * spectrum.lobe_width for period in periods)
+def _has_narrow_lobes(spectrum: Spectrum) -> bool:
+    """Return whether the wavelengths of a ray have lobes of their own: narrow ones, of orders."""
+    is_continuum = isinstance(spectrum, GratingSpectrum) and not isinstance(spectrum.grid, OrderGrid)
+    return not is_continuum and spectrum.lobe_width < MAX_NARROW_LOBE

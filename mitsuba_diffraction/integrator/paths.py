@@ -119,6 +119,8 @@ def define_eye_paths() -> type:
         def __init__(self, scene: mi.Scene, gratings: Gratings, max_depth: int, rr_depth: int) -> None:
             mi.SamplingIntegrator.__init__(self, mi.Properties("eye_paths"))
             self.gratings, self.candidates = gratings, Candidates(scene, gratings.shapes)
+            # Whether L G X G E and L G X M E are short enough: a literal, which removes what serves them alone.
+            self.guides = not 0 <= max_depth < 4
             # Opaque, so that all depths run the same kernel.
             self.max_depth = dr.opaque(mi.UInt32, max_depth % 2**32)
             self.rr_depth = dr.opaque(mi.UInt32, rr_depth)
@@ -149,7 +151,9 @@ def define_eye_paths() -> type:
                 si_bsdf = with_surviving_wavelengths(si, throughput, grating_only)
                 from_light = on_grating & has_other_vertex & (from_eye_only ^ True)
                 # In L G X G E, few directions from X that the BSDF samples lead to the first G.
-                to_gratings = active & from_eye_only & (on_grating ^ True) & _is_smooth_reflector(bsdf)
+                to_gratings = (
+                    mi.Bool(self.guides) & active & from_eye_only & (on_grating ^ True) & _is_smooth_reflector(bsdf)
+                )
                 bsdf_probability = dr.select(to_gratings, 1 - _GRATING_PROBABILITY, 1)
 
                 # Emitter sampling
@@ -160,15 +164,14 @@ def define_eye_paths() -> type:
                 wo = si.to_local(ds.d)
                 value, pdf = bsdf.eval_pdf(ctx, si_bsdf, wo, samples_emitter & (ds.pdf != 0))
                 slots = self.candidates.slots(si, on_grating & samples_emitter)
-                by_candidates = slots > 0
                 mis_weight = _power_heuristic(ds.pdf, bsdf_probability * pdf)
                 of_candidates = self.candidates.relative_density(slots) * pdf
-                mis_weight = dr.select(by_candidates, quotient(ds.pdf, ds.pdf + of_candidates), mis_weight)
+                mis_weight = dr.select(slots > 0, quotient(ds.pdf, ds.pdf + of_candidates), mis_weight)
                 mis_weight = dr.select(ds.delta, 1, mis_weight)
                 result += dr.select(samples_emitter & (ds.pdf != 0), throughput * value * emitted * mis_weight, 0)
                 if dr.hint(self.candidates.any, mode="scalar"):
-                    light = self.candidates.sample(scene, sampler, si_bsdf, bsdf, slots, by_candidates)
-                    result += dr.select(by_candidates, throughput * light, 0)
+                    light = self.candidates.sample(scene, sampler, si_bsdf, slots, slots > 0)
+                    result += dr.select(slots > 0, throughput * light, 0)
 
                 # BSDF sampling, or the direction to a point on a grating; the next ray may hit an emitter.
                 guided = to_gratings & (sampler.next_1d(active) < _GRATING_PROBABILITY)
@@ -176,11 +179,17 @@ def define_eye_paths() -> type:
                 to_point = si.spawn_ray_to(ps.p)
                 distance = dr.norm(ps.p - to_point.o)
                 value, pdf = bsdf.eval_pdf(ctx, si_bsdf, si.to_local(to_point.d), guided)
+                # The last vertex of a path has no other light to find than that of candidates, but for specular light.
+                is_last = (slots > 0) & (depth + 1 >= self.max_depth)
+                has_ended = active & is_last & ~mi.has_flag(bsdf.flags(), mi.BSDFFlags.Delta)
+                valid |= has_ended
+                active &= ~has_ended
                 unguided = active & (guided ^ True)
                 bs, weight = bsdf.sample(ctx, si_bsdf, sampler.next_1d(active), sampler.next_2d(active), unguided)
                 delta = mi.has_flag(bs.sampled_type, mi.BSDFFlags.Delta)
                 eta *= dr.select(guided, 1, bs.eta)
                 valid |= active & (mi.has_flag(bs.sampled_type, mi.BSDFFlags.Null) ^ True)
+                active &= ~is_last | delta
                 from_eye_only |= (depth == 1) & (delta | on_grating)
                 has_other_vertex |= on_grating ^ True
                 ray = si.spawn_ray(dr.select(guided, to_point.d, si.to_world(bs.wo)))
@@ -198,7 +207,7 @@ def define_eye_paths() -> type:
                 throughput *= dr.select(to_gratings & (delta ^ True), mixed, weight / bsdf_probability)
                 active &= dr.any(throughput != 0)
                 # Emitters that are never sampled are not found by paths from the light.
-                counts = active & ((from_light & (pdf_emitter > 0)) ^ True) & ~(by_candidates & ~delta)
+                counts = active & ((from_light & (pdf_emitter > 0)) ^ True) & (delta | (slots == 0))
                 mis_weight = _power_heuristic(bsdf_pdf, dr.select(delta, 0, pdf_emitter))
                 result += dr.select(counts, throughput * ds.emitter.eval(next_si, counts) * mis_weight, 0)
 

@@ -56,14 +56,19 @@ def eye_paths(built, depth=2):
     return eye
 
 
-def estimates(built, integrator, count=2**16, seed=0, wavelengths=WAVELENGTHS):
-    """The radiance of one ray to the middle of the plate, at fixed wavelengths: mean and standard error, (4,)."""
+def samples(built, integrator, count, seed=0, wavelengths=WAVELENGTHS):
+    """The radiance of one ray to the middle of the plate, at fixed wavelengths, (4, count)."""
     sampler = mi.load_dict({"type": "independent"})
     sampler.seed(seed, count)
     ray = mi.Ray3f(mi.Point3f(EYE), -dr.normalize(mi.Vector3f(EYE)))
     ray.wavelengths = mi.Spectrum(wavelengths)
     ray.o = ray.o + dr.zeros(mi.Float, count)
-    found = np.array(integrator.sample(built, sampler, mi.RayDifferential3f(ray))[0], np.float64)
+    return np.array(integrator.sample(built, sampler, mi.RayDifferential3f(ray))[0], np.float64)
+
+
+def estimates(built, integrator, count):
+    """Mean and standard error of `samples`, (4,)."""
+    found = samples(built, integrator, count)
     return found.mean(axis=1), found.std(axis=1, ddof=1) / np.sqrt(count)
 
 
@@ -80,41 +85,6 @@ def sum_over_lamp(built, shape, side=400, wavelengths=WAVELENGTHS):
     value = si.bsdf().eval(mi.BSDFContext(), si, si.to_local(omega))
     value *= dr.maximum(-dr.dot(omega, ps.n), 0) / (square * ps.pdf)
     return np.array(value, np.float64).mean(axis=1)
-
-
-def two_lamps():
-    """Where the orders 1 and −1 of `surface` lead for the ray of `estimates`."""
-    return {"rectangle": lamp("rectangle", (-1.2, 1, 2.2), 0.3), "disk": lamp("disk", (0, 1, 2.3), 0.25)}
-
-
-@pytest.mark.parametrize(
-    "bsdf",
-    [
-        pytest.param(surface, id="bare"),
-        pytest.param(partial(surface, "elaphe", 26.0), id="continuum", marks=pytest.mark.slow),
-        pytest.param(
-            lambda: {"type": "twosided", "bsdf": profile(material="Al", coat_ior=1.5)},
-            id="coat",
-            marks=pytest.mark.slow,
-        ),
-        pytest.param(
-            lambda: {
-                **{"type": "normalmap", "normalmap": bitmap(np.tile([[[0.6, 0.45, 0.98]]], (2, 2, 1)))},
-                "bsdf": grating(
-                    coherence_length=13.0, int_ior=1.6, base={"type": "diffuse", "reflectance": uniform(0.5)}
-                ),
-            },
-            id="normal map and base",
-        ),
-    ],
-)
-def test_light_of_lamps_is_the_sum_over_their_points(bsdf, llvm):
-    built = scene(bsdf(), **two_lamps())
-    lamps = [shape for shape in built.shapes() if shape.is_emitter()]
-    wanted = np.sum([sum_over_lamp(built, shape) for shape in lamps], axis=0)
-    found, error = estimates(built, eye_paths(built), 2**17)
-    assert (error < 0.02 * wanted.max()).all()
-    np.testing.assert_array_less(np.abs(found - wanted), 4 * error + 1e-3 * wanted.max())
 
 
 def spots():
@@ -185,6 +155,119 @@ def test_the_guess_is_nowhere_below_the_radiance(name, llvm):
 
 def test_sixty_lamps_have_twelve_outlines(llvm):
     assert int(UnshadowedLight(scene({"type": "diffuse"}, **many_lamps()))._count[0]) == 12
+
+
+def two_lamps(side=1):
+    """Where the orders 1 and −1 of `surface` lead for the ray of `estimates`, above or below the plate."""
+    return {"rectangle": lamp("rectangle", (-1.2, 1, 2.2 * side), 0.3), "disk": lamp("disk", (0, 1, 2.3 * side), 0.25)}
+
+
+def on_base():
+    """Under a normal map, of two gratings of which samples may fail."""
+    base = {"type": "roughconductor", "alpha": 0.4}
+    bsdf = grating(coherence_length=13.0, int_ior=1.6, base=base)
+    return {"type": "normalmap", "normalmap": bitmap(np.tile([[[0.6, 0.45, 0.98]]], (2, 2, 1))), "bsdf": bsdf}
+
+
+def blend():
+    """A grating partly covered by paint, with holes."""
+    paint = {"type": "roughplastic", "alpha": 0.2}
+    return {
+        **{"type": "mask", "opacity": 0.7},
+        "nested": {"type": "blendbsdf", "weight": 0.4, "grating": surface(coherence_length=26.0), "paint": paint},
+    }
+
+
+SURFACES = {
+    "bare": surface,
+    "continuum": partial(surface, "elaphe", 26.0),
+    "coat": lambda: {"type": "twosided", "bsdf": profile(material="Al", coat_ior=1.5)},
+    "sheet": lambda: profile(transmission="sheet"),
+    "normal map and base": on_base,
+    "blend and mask": blend,
+}
+
+
+@pytest.mark.few(2)
+@pytest.mark.parametrize("name", SURFACES)
+def test_light_of_lamps_is_the_sum_over_their_points(name, llvm):
+    side = -1 if name == "sheet" else 1
+    built = scene(SURFACES[name](), **two_lamps(side))
+    lamps = [shape for shape in built.shapes() if shape.is_emitter()]
+    wanted = np.sum([sum_over_lamp(built, shape) for shape in lamps], axis=0)
+    found, error = estimates(built, eye_paths(built), 2**17)
+    assert (error < 0.02 * wanted.max()).all()
+    np.testing.assert_array_less(np.abs(found - wanted), 4 * error + 1e-3 * wanted.max())
+
+
+@pytest.mark.slow
+def test_each_of_several_gratings_draws_its_own_candidates(llvm):
+    """Three plates with a BSDF each and two with the same, of which each stands at the origin once."""
+    bsdfs = [surface("elaphe", 26.0), surface(), profile(material="Al", coat_ior=1.5), surface("sinusoidal")]
+    for middle in range(len(bsdfs)):
+        plates = {
+            f"plate{k}": {"type": "rectangle", "to_world": at(4 * (k - middle), 0, 0), "bsdf": bsdf}
+            for k, bsdf in enumerate(bsdfs)
+        }
+        built = mi.load_dict({"type": "scene", **plates, **two_lamps()})
+        lamps = [shape for shape in built.shapes() if shape.is_emitter()]
+        wanted = np.sum([sum_over_lamp(built, shape) for shape in lamps], axis=0)
+        found, error = estimates(built, eye_paths(built), 2**16)
+        assert (error < 0.03 * wanted.max()).all()
+        np.testing.assert_array_less(np.abs(found - wanted), 4 * error + 1e-3 * wanted.max())
+
+
+def obstacle():
+    """A screen before the lamps; the sky remains."""
+    black = {"type": "diffuse", "reflectance": uniform(0.0)}
+    return {
+        **two_lamps(),
+        "screen": {"type": "rectangle", "to_world": at(-0.5, 0.75, 1.6).scale(0.5), "bsdf": black},
+        "sky": {"type": "constant", "radiance": uniform(0.002)},
+    }
+
+
+def lamp_in(bsdf):
+    """A lamp behind a pane, or opposite to a mirror, that is met by the orders of `two_lamps`."""
+    pane = {"type": "rectangle", "to_world": towards((-0.6, 0.9, 2.0), scale=1.2), "bsdf": bsdf}
+    return {**two_lamps(), "far": lamp(position=(-2.5, 3, 6), scale=2.0), "pane": pane}
+
+
+FIREFLIES = {
+    "lamps behind an obstacle": obstacle,
+    "lamps of 1:1e4": lambda: {
+        "bright": lamp("disk", (2.0, -0.5, 2.0), 0.1, uniform(1e4)),
+        "rectangle": lamp("rectangle", (-1.2, 1, 2.2), 0.3),
+    },
+    "lamp that touches": lambda: {"lamp": {**lamp("sphere"), "to_world": at(-0.3, 0.3, 0.1).scale(0.3)}},
+    "lamp behind glass": lambda: lamp_in({"type": "thindielectric"}),
+    "lamp in a mirror": lambda: {
+        "lamp": lamp("disk", (1.5, 1.0, 1.5), 0.4),
+        "mirror": {
+            **{"type": "rectangle", "to_world": at(-2.0, 0, 0).rotate([0, 1, 0], 90).scale(3)},
+            "bsdf": {"type": "twosided", "bsdf": {"type": "conductor", "material": "none"}},
+        },
+    },
+    "lamp of many triangles": lambda: {"lamp": lamp("cube", (-1.2, 1, 2.2), 0.2)},
+    "sixty lamps": many_lamps,
+    "environment map": lambda: {"sky": environment()},
+}
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", FIREFLIES)
+def test_no_pixel_stands_out_more_than_with_path(name, llvm):
+    """One ray: the mean is that of `path`, and the largest of many pixels of 16 samples is not further above it."""
+    depth = 4
+    built = scene(surface(), **FIREFLIES[name]())
+    path = mi.load_dict({"type": "path", "max_depth": depth})
+    wanted, found = (samples(built, of, 2**19) for of in (path, eye_paths(built, depth)))
+    errors = [each.std(axis=1, ddof=1) / np.sqrt(each.shape[1]) for each in (wanted, found)]
+    np.testing.assert_array_less(np.abs(found.mean(axis=1) - wanted.mean(axis=1)), 4 * np.hypot(*errors) + 1e-9)
+    pixels = [each.mean(axis=0).reshape(-1, 16).mean(axis=1) for each in (wanted, found)]
+    largest = [each.max() / each.mean() for each in pixels]
+    assert largest[1] < 1.1 * largest[0], largest
+    assert pixels[1].var() < 1.1 * pixels[0].var()
 
 
 @pytest.mark.slow
