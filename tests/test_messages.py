@@ -9,7 +9,7 @@ import pytest
 
 import mitsuba_diffraction
 from mitsuba_diffraction.precomputation.recipe import Recipe
-from mitsuba_diffraction.render.scene import load_spectral_scene
+from mitsuba_diffraction.render.scene_file import SceneFile
 
 SCENES = Path(__file__).parents[1] / "scenes"
 SCENE = """<scene version="3.0.0"><default name="light" value="sun"/><include filename="lights/$light.xml"/>
@@ -55,7 +55,7 @@ def test_messages_name_what_is_available(body, parameters, words, tmp_path, llvm
     (tmp_path / "skin.exr").touch()
     (tmp_path / "scene.xml").write_text(SCENE % body)
     with pytest.raises(ValueError, match=words):
-        load_spectral_scene(tmp_path / "scene.xml", parameters=parameters)
+        SceneFile(tmp_path / "scene.xml", parameters).load()
 
 
 @pytest.mark.parametrize(

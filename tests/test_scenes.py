@@ -18,8 +18,8 @@ from scipy.special import j1
 import mitsuba_diffraction as md
 from mitsuba_diffraction.inverse_design import hologram as gratings_of
 from mitsuba_diffraction.precomputation.recipe import Recipe
-from mitsuba_diffraction.render import parsed_scene, render
-from mitsuba_diffraction.render.scene import load_spectral_scene
+from mitsuba_diffraction.render import render, scene_file
+from mitsuba_diffraction.render.scene_file import SceneFile
 
 ROOT = Path(__file__).parents[1]
 SCENES = ROOT / "scenes"
@@ -51,7 +51,7 @@ def llvm():
 @pytest.mark.few(1)
 @pytest.mark.parametrize("name", ["blaze", "elaphe", "projection", "screen", "xenopeltis", "xenopeltis_sphere"])
 def test_scene_renders(llvm, name):
-    check(render(SCENES / f"{name}.xml", spp=4, width=16, height=16), 16, 16)
+    check(render(SceneFile(SCENES / f"{name}.xml", size=(16, 16)), spp=4), 16, 16)
 
 
 @pytest.mark.slow
@@ -62,7 +62,7 @@ def test_a_snake_by_taylor_terms_is_that_of_slices_with_both_integrators(llvm):
         parameters = {"skin": "xenopeltis_tile", "depth": "3", **parameters}
         with warnings.catch_warnings():
             warnings.filterwarnings("ignore", "taylor: 20 terms", UserWarning)
-            built = load_spectral_scene(SCENES / "xenopeltis.xml", width=48, parameters=parameters)
+            built = SceneFile(SCENES / "xenopeltis.xml", parameters, size=(48, None)).load()
         for name in ("path", "diffraction_path"):
             integrator = mi.load_dict({"type": name, "max_depth": 3})
             pictures = [mi.render(built, integrator=integrator, spp=24, seed=seed) for seed in range(16)]
@@ -78,7 +78,7 @@ def test_a_snake_by_taylor_terms_is_that_of_slices_with_both_integrators(llvm):
     ("name", "parameters"), [("glasses", {}), ("spectroscope", {}), ("spectroscope", {"grating": "transmission_300"})]
 )
 def test_scene_of_transmitted_light_renders(llvm, name, parameters):
-    check(render(SCENES / f"{name}.xml", spp=4, width=32, parameters=parameters), 32, 18)
+    check(render(SceneFile(SCENES / f"{name}.xml", parameters, size=(32, None)), spp=4), 32, 18)
 
 
 @pytest.mark.slow
@@ -88,7 +88,7 @@ def test_scene_of_a_scan_renders(llvm, tmp_path):
     recipe = tmp_path / "skin.toml"
     recipe.write_text('[surface]\nprofile = "elaphe_synthetic"\nsize = 8.0\n')
     for name, parameters in (("scan", {"spectrum": str(path)}), ("elaphe", {"skin": str(recipe)})):
-        check(render(SCENES / f"{name}.xml", spp=4, width=16, height=16, parameters=parameters), 16, 16)
+        check(render(SceneFile(SCENES / f"{name}.xml", parameters, size=(16, 16)), spp=4), 16, 16)
 
 
 ON_ONE_CORE = """
@@ -152,7 +152,7 @@ PICTURES = [
 @pytest.mark.slow
 @pytest.mark.parametrize(("name", "parameters"), PICTURES)
 def test_scene_with_models_renders(llvm, small_scenes, name, parameters):
-    check(render(small_scenes / f"{name}.xml", spp=4, width=32, parameters=parameters), 32, 18)
+    check(render(SceneFile(small_scenes / f"{name}.xml", parameters, size=(32, None)), spp=4), 32, 18)
 
 
 def hit(small_scenes, name, origins, directions):
@@ -225,12 +225,12 @@ def test_models_are_made_when_a_scene_is_first_read(tmp_path, monkeypatch):
     texture = '<texture type="bitmap" id="t"><string name="filename" value="models/a.png"/></texture>'
     scene = own / "scene.xml"
     scene.write_text(f'<scene version="3.0.0"><!-- made by: python scenes/disc.py -->{texture}</scene>')
-    monkeypatch.setattr(parsed_scene, "examples_folder", lambda: package.parent)
-    assert scene in parsed_scene.files_of_scene(scene)
+    monkeypatch.setattr(scene_file, "examples_folder", lambda: package.parent)
+    assert scene in SceneFile(scene).files()
     assert [(own / "models" / f"{name}.png").read_text() for name in "ab"] == ["a", "mine"]
     scene.write_text(scene.read_text().replace("a.png", "c.png"))
     with pytest.raises(ValueError, match=r"models/c.png: no such file; it is made by: python scenes/disc.py"):
-        parsed_scene.files_of_scene(scene)
+        SceneFile(scene).files()
 
 
 def test_load_file_makes_models_too(tmp_path, monkeypatch, llvm):
@@ -238,7 +238,7 @@ def test_load_file_makes_models_too(tmp_path, monkeypatch, llvm):
         (tmp_path / folder).mkdir(parents=True)
     maker = "from PIL import Image\ndef make(folder):\n    Image.new('L', (2, 2)).save(folder / 'a.png')\n"
     (tmp_path / "package" / "scenes" / "disc.py").write_text(maker)
-    monkeypatch.setattr(parsed_scene, "examples_folder", lambda: tmp_path / "package")
+    monkeypatch.setattr(scene_file, "examples_folder", lambda: tmp_path / "package")
     texture = '<texture type="bitmap" id="t"><string name="filename" value="models/$name.png"/></texture>'
     scene = tmp_path / "scenes" / "scene.xml"
     scene.write_text(f'<scene version="3.0.0"><!-- made by: python scenes/disc.py -->{texture}</scene>')
@@ -252,7 +252,7 @@ def test_load_file_makes_models_too(tmp_path, monkeypatch, llvm):
 def test_a_scene_names_every_script_that_makes_its_files(tmp_path, monkeypatch):
     shutil.copytree(SCENES, tmp_path / "scenes", ignore=shutil.ignore_patterns("models", "out", "gallery.npz"))
     (tmp_path / "precompute").symlink_to(ROOT / "precompute")
-    monkeypatch.setattr(parsed_scene, "examples_folder", lambda: tmp_path / "nowhere")
+    monkeypatch.setattr(scene_file, "examples_folder", lambda: tmp_path / "nowhere")
     found = 0
     for path in (tmp_path / "scenes").glob("*.xml"):
         text = path.read_text()
@@ -261,7 +261,7 @@ def test_a_scene_names_every_script_that_makes_its_files(tmp_path, monkeypatch):
         commands = " ".join(text.partition("made by:")[2].split()).partition(" -->")[0]
         wanted = re.match(r"(?:python scenes/\w+\.py(?: && )?)+", commands)[0]
         with pytest.raises(ValueError, match="it is made by: ") as raised:
-            parsed_scene.files_of_scene(path)
+            SceneFile(path).files()
         assert str(raised.value).endswith(wanted.strip(" &"))
         found += 1
     assert found > 6
@@ -273,11 +273,11 @@ def test_a_surface_by_its_name_is_part_of_the_scenes_digest(tmp_path, monkeypatc
         '<scene version="3.0.0"><bsdf type="diffraction_grating" id="g">'
         '<string name="filename" value="elaphe_afm"/></bsdf></scene>'
     )
-    names = {path.name for path in parsed_scene.files_of_scene(scene)}
+    names = {path.name for path in SceneFile(scene).files()}
     assert {"elaphe_afm.toml", "elaphe_afm_100x100.png"} <= names
-    before = parsed_scene.scene_digest(scene)
+    before = SceneFile(scene).digest()
     monkeypatch.setattr(Recipe, "digest", lambda recipe: "another")
-    assert parsed_scene.scene_digest(scene) != before
+    assert SceneFile(scene).digest() != before
 
 
 # ---------------------------------------------------------------- the beetle
@@ -535,8 +535,8 @@ def test_the_ground_texture_tiles():
 def test_lines_are_where_the_grating_equation_has_them(llvm, name, screen, lines_per_mm, offset, lines, parameters):
     path, size = SCENES / f"{name}.xml", (320, 180)
     parameters = {"room": "1e-12", **parameters}
-    image = render(path, spp=16, width=size[0], height=size[1], parameters=parameters)
-    built = load_spectral_scene(path, width=size[0], height=size[1], parameters=parameters)
+    image = render(SceneFile(path, parameters, size=(size[0], size[1])), spp=16)
+    built = SceneFile(path, parameters, size=(size[0], size[1])).load()
     pixel = dr.arange(mi.UInt32, size[0] * size[1])
     at = mi.Point2f(pixel % size[0], pixel // size[0]) + 0.5
     ray, _ = built.sensors()[0].sample_ray(0, 0.5, at / mi.Point2f(size), mi.Point2f(0.5))

@@ -22,6 +22,7 @@ if TYPE_CHECKING:
 
     from ..optics.color import ViewTransform
     from ..render.passes import Estimate
+    from ..render.scene_file import SceneFile
     from ..render.spectral_image import SpectralImage
 
 _log = logging.getLogger(__name__)
@@ -112,14 +113,14 @@ def render(
     import mitsuba as mi
 
     from ..render.cluster import trace_on
-    from ..render.parsed_scene import files_of_scene, has_alpha, named_sample_count
     from ..render.passes import checkpoint_path, trace_locally
+    from ..render.scene_file import SceneFile
     from ..render.turntable import animations_of, save_animation
     from ..render.turntable import orbit as motions_of_orbit
     from ..variants import choose_variant
 
-    where: dict[str, Any] = {"parameters": scene_parameters(define), "materials": materials_of(material)}
-    reads = files_of_scene(scene, **where)
+    scene_file = SceneFile(scene, scene_parameters(define), materials_of(material), (width, height))
+    reads = scene_file.files()
     target = output or Path(free_name(scene.stem, lambda stem: _outputs(Path(f"{stem}.exr"), frames), reads) + ".exr")
     check_outputs(reads, [("-o", path) for path in _outputs(target, frames)], overwrite=overwrite)
     checkpoints = [path for path in map(checkpoint_path, _pictures(target, frames)) if path.exists()]
@@ -130,14 +131,13 @@ def render(
     mi.set_variant(choose_variant(variant))
     if denoise is None:
         denoise = _requests_denoising(scene)
-    named = None if spp else named_sample_count(scene, where["parameters"])
+    named = None if spp else scene_file.sample_count()
     spp = spp or named or 64
     tracer = trace_locally if dask is None else trace_on(dask)
-    motions = [None] if frames is None else motions_of_orbit(scene, frames, **where)
-    alpha = has_alpha(scene, where["parameters"])
+    motions = [None] if frames is None else motions_of_orbit(scene_file, frames)
+    alpha = scene_file.has_alpha()
     if alpha and target.suffix.lower() == ".jpg":
         raise RequestError(f"-o: got {target}, but the scene has alpha, which JPEG has not; wanted .exr or .png")
-    where |= {"width": width, "height": height}
     request: dict[str, Any] = {"spp": spp, "seed": seed, "until_error": until_error}
     request |= {"seconds": checkpoint, "tracer": tracer}
     if until_error is None:  # else nobody knows the time
@@ -150,9 +150,8 @@ def render(
     with durations():
         for number, (path, motion) in enumerate(zip(pictures, motions, strict=True)):
             factor = _picture(
-                scene,
+                scene_file.moved(motion),
                 path,
-                {**where, "motion": motion},
                 request,
                 resume=resume,
                 stored=stored,
@@ -251,9 +250,8 @@ def _outputs(target: Path, frames: int | None) -> list[Path]:
 
 
 def _picture(
-    scene: Path,
+    scene_file: SceneFile,
     path: Path,
-    where: dict[str, Any],
     request: dict[str, Any],
     *,
     resume: bool,
@@ -267,7 +265,6 @@ def _picture(
     """Render, save and report one picture; return the exposure of its preview, if it is known.
 
     Args:
-        where: parameters, materials, size and motion, for `load_spectral_scene`.
         request: the other arguments of `passes.render`.
         stored: arguments of `SpectralImage.save`.
         view: of the preview.
@@ -290,8 +287,7 @@ def _picture(
     try:
         with progress_bar(label, "spp", "loading and compiling") as progress:
             image = trace(
-                scene,
-                **where,
+                scene_file,
                 **request,
                 checkpoint=checkpoint,
                 finished=earlier,

@@ -62,10 +62,10 @@ def _with_models(load: Callable[..., mi.Object]) -> Callable[..., mi.Object]:
     @functools.wraps(load)
     def loader(path: str, *args: object, **kwargs: object) -> mi.Object:
         if os.path.isfile(path) and b"made by:" in Path(path).read_bytes():
-            from ..render.parsed_scene import parsed
+            from ..render.scene_file import SceneFile
 
             own = ("parallel", "optimize")
-            with parsed(path, {name: str(value) for name, value in kwargs.items() if name not in own}):
+            with SceneFile(path, {name: str(value) for name, value in kwargs.items() if name not in own}).parsed():
                 pass  # made while it is parsed
         return load(path, *args, **kwargs)
 

@@ -1,6 +1,7 @@
 """From a scene to a spectral image."""
 
 from .passes import render
+from .scene_file import SceneFile
 from .spectral_image import SpectralImage
 
-__all__ = ["SpectralImage", "render"]
+__all__ = ["SceneFile", "SpectralImage", "render"]

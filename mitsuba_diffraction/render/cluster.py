@@ -23,7 +23,6 @@ from numpy.typing import NDArray
 
 from ..errors import RequestError, pip_install
 from .film import LightOfBands
-from .parsed_scene import scene_digest
 from .passes import Job, Tracer, trace_band, versions
 
 # Held while a pass is traced: it uses all threads of Dr.Jit, and two at a time would only need more memory.
@@ -124,12 +123,11 @@ def _trace_on_worker(job: Job, index: int) -> NDArray[np.float32]:
 def scene_of(job: Job) -> mi.Scene:
     """Load the scene of a job, once; raise RuntimeError if the scene or one of its files differs from the job."""
     try:
-        scene = job.load()
-        content = scene_digest(job.scene, job.where["parameters"], job.where["materials"])
+        scene, content = job.scene.load(), job.scene.digest()
     except (RequestError, OSError) as error:
         raise RuntimeError(f"a worker cannot load the scene: {error}") from None
     if content != job.content:
-        raise RuntimeError(f"{job.scene}: on a worker, the scene or a file that it references is different")
+        raise RuntimeError(f"{job.scene.path}: on a worker, the scene or a file that it references is different")
     return scene
 
 

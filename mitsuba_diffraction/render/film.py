@@ -80,7 +80,7 @@ def trace_pass(
     processor. Integrators that need Mitsuba's film (`needs_mitsubas_film`) are not reproducible in the last bits.
 
     Args:
-        scene: from `load_spectral_scene`.
+        scene: from `SceneFile.load`.
         spp: samples per pixel; the scene's sampler may draw more (`sampler_of`).
         seed: 32 bits.
         integrator: replaces the integrator of the scene.
@@ -119,7 +119,7 @@ def check_memory(scene: mi.Scene, spp: int, bands: tuple[Rows, ...] | None = Non
     values of four wavelengths), and 8 bytes per pixel of the film. With Mitsuba's film, 14 n and 24 n were measured.
 
     Args:
-        scene: from `load_spectral_scene`.
+        scene: from `SceneFile.load`.
         spp: samples per pixel of the largest pass.
         bands: in which it is traced; default: whole.
 

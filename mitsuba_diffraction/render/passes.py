@@ -24,11 +24,10 @@ import time
 import weakref
 from collections.abc import Callable, Generator, Iterator, Mapping
 from contextlib import closing, contextmanager, nullcontext
-from dataclasses import asdict, dataclass, fields
+from dataclasses import asdict, dataclass, fields, replace
 from functools import cache, cached_property, partial
 from importlib import metadata
 from pathlib import Path
-from typing import Any
 from zipfile import BadZipFile
 
 import mitsuba as mi
@@ -52,11 +51,10 @@ from .film import (
     sampler_of,
     trace_pass,
 )
-from .parsed_scene import has_alpha, scene_digest
-from .scene import load_spectral_scene, recorded_range, warn_of_gratings
+from .scene import recorded_range, warn_of_gratings
+from .scene_file import SceneFile
 from .scene_film import SpectralRange, channel_wavelengths
 from .scene_light import max_plausible_luminance
-from .scene_materials import Materials
 from .spectral_image import SpectralImage, split_rows
 
 _log = logging.getLogger(__name__)
@@ -328,8 +326,7 @@ class Job:
     """Everything that determines the bits of a picture, except for the processor; sent to workers.
 
     Attributes:
-        scene: absolute path of the XML file.
-        where: the arguments width, height, parameters, materials and motion of `load_spectral_scene`.
+        scene: the scene, by its absolute path.
         variant: Mitsuba variant.
         seed: random seed.
         samples: samples per pixel of each pass.
@@ -337,12 +334,11 @@ class Job:
         until_error: see `render`.
         alpha: whether alpha is recorded.
         spectral_range: (shortest, longest) wavelength that is recorded, nm.
-        content: digest of the scene and the files it references (`scene_digest`).
+        content: digest of the scene and the files it references (`SceneFile.digest`).
         versions: of the packages involved.
     """
 
-    scene: str
-    where: dict[str, Any]
+    scene: SceneFile
     variant: str
     seed: int
     samples: tuple[int, ...]
@@ -355,15 +351,12 @@ class Job:
 
     def digest(self) -> str:
         """Return the SHA-256 of everything but the path of the scene."""
-        request = {name: value for name, value in asdict(self).items() if name != "scene"}
+        request = asdict(self)
+        del request["scene"]["path"]
         return hashlib.sha256(json.dumps(request, sort_keys=True).encode()).hexdigest()
 
     def __hash__(self) -> int:
         return hash(self.digest())
-
-    def load(self) -> mi.Scene:
-        """Load the scene; for errors see `load_spectral_scene`."""
-        return load_spectral_scene(self.scene, **self.where)
 
 
 # Yields the results of `trace_band` for `first`, `first` + 1, … in order; see `trace_locally`.
@@ -427,15 +420,10 @@ def versions() -> tuple[str, ...]:
 
 
 def render(
-    scene_path: str | os.PathLike[str],
+    scene_file: SceneFile | str | os.PathLike[str],
     *,
     spp: int,
-    width: int | None = None,
-    height: int | None = None,
     seed: int = 0,
-    parameters: Mapping[str, str] | None = None,
-    materials: Materials | None = None,
-    motion: tuple[float, ...] | None = None,
     until_error: float | None = None,
     checkpoint: str | os.PathLike[str] | None = None,
     seconds: float = 60.0,
@@ -450,10 +438,10 @@ def render(
 
     The samples are split into passes with independent seeds, which are added in the order of their indices. The same
     seed therefore gives the same bits (within the limits of `trace_pass`), interrupted or not, on one machine or on
-    several. For `width`, `height`, `parameters`, `materials` and `motion` see `load_spectral_scene`.
+    several.
 
     Args:
-        scene_path: an XML scene; its film may be of any kind.
+        scene_file: an XML scene, by its path alone if nothing else is requested; its film may be of any kind.
         spp: samples per pixel, four wavelengths each; the scene's sampler may add up to three.
         seed: random seed, not negative.
         until_error: stop when the relative error of the picture (`error_of_picture`) is at most this; spp is then the
@@ -478,7 +466,7 @@ def render(
 
     Raises:
         FileNotFoundError: if there is no such scene.
-        ValueError: (a) as for `load_spectral_scene`; (b) if a number is out of range; (c) if there is too little memory
+        ValueError: (a) as for `SceneFile.load`; (b) if a number is out of range; (c) if there is too little memory
             for the picture or too little disk for its bands; (d) if the checkpoint belongs to another rendering or is
             in use.
         RuntimeError: if rendering failed, with the cause on one line.
@@ -487,9 +475,9 @@ def render(
         Interrupted: at the end of the current pass on the first Ctrl-C, with the picture so far, after a checkpoint.
         KeyboardInterrupt: immediately on the second Ctrl-C, or if no pass has been completed.
     """
-    where: dict[str, Any] = {"width": width, "height": height, "motion": motion}
-    where |= {"parameters": parameters or {}, "materials": materials or {}}
-    job, scene = _job(scene_path, where, spp, seed, until_error)
+    if not isinstance(scene_file, SceneFile):
+        scene_file = SceneFile(scene_file)
+    job, scene = _job(scene_file, spp, seed, until_error)
     if finished == job.digest():
         raise Finished
 
@@ -515,7 +503,7 @@ def render(
     if sums.done < len(job.bands):
         raise KeyboardInterrupt
     _warn_of_implausible_pixels(sums.luminance, max_luminance)
-    image = _image(sums, job, Path(scene_path).name, complete=complete)
+    image = _image(sums, job, Path(scene_file.path).name, complete=complete)
     if not complete:
         raise Interrupted(image)
     return image
@@ -561,9 +549,7 @@ def _trace(
     return complete
 
 
-def _job(
-    scene_path: str | os.PathLike[str], where: dict[str, Any], spp: int, seed: int, until_error: float | None
-) -> tuple[Job, mi.Scene]:
+def _job(scene_file: SceneFile, spp: int, seed: int, until_error: float | None) -> tuple[Job, mi.Scene]:
     """Check the arguments of `render`; return its job and the scene."""
     if spp < 1:
         raise RequestError(f"spp: got {spp}, wanted a positive number of samples per pixel")
@@ -572,7 +558,7 @@ def _job(
     if until_error is not None and not 0 < until_error < 1:
         raise RequestError(f"until_error: got {until_error}, wanted a relative error between 0 and 1, such as 0.01")
     with stage("reading"):
-        scene = load_spectral_scene(scene_path, **where)
+        scene = scene_file.load()
     sampler, whole = scene.sensors()[0].sampler(), needs_mitsubas_film(scene.integrator())
     if whole and not is_independent(sampler):
         _log.warning(
@@ -584,16 +570,15 @@ def _job(
     with stage("checks"):
         warn_of_gratings(scene)
     job = Job(
-        scene=str(Path(scene_path).resolve()),
-        where=where,
+        scene=replace(scene_file, path=str(Path(scene_file.path).resolve())),
         variant=mi.variant(),
         seed=seed,
         samples=samples,
         bands=bands_of(scene),
         until_error=until_error,
-        alpha=has_alpha(scene_path, where["parameters"]) and not whole,
+        alpha=scene_file.has_alpha() and not whole,
         spectral_range=recorded_range(scene),
-        content=scene_digest(scene_path, where["parameters"], where["materials"]),
+        content=scene_file.digest(),
         versions=versions(),
     )
     return job, scene

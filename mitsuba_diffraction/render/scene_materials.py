@@ -47,7 +47,7 @@ def warn_of_unused_materials(state: mi.parser.ParserState, materials: Materials)
 
 
 def replace_materials(state: mi.parser.ParserState, materials: Materials) -> None:
-    """Replace BSDFs by gratings; see `load_spectral_scene`."""
+    """Replace BSDFs by gratings; see `SceneFile`."""
     bsdfs = {node.props.id(): k for k, node in enumerate(state.nodes) if node.type == mi.ObjectType.BSDF}
     for name, values in materials.items():
         if name not in bsdfs:

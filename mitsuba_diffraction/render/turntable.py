@@ -3,10 +3,10 @@
 from __future__ import annotations
 
 import importlib.util
-import os
 import subprocess
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable
 from contextlib import suppress
+from dataclasses import replace
 from pathlib import Path
 from tempfile import TemporaryFile
 from typing import TYPE_CHECKING
@@ -18,8 +18,7 @@ from scipy.spatial.transform import Rotation
 
 from ..files.outputs import MARK
 from ..files.writing import encoded_file, whole_file
-from .scene import load_spectral_scene
-from .scene_materials import Materials
+from .scene_file import SceneFile
 
 if TYPE_CHECKING:
     from PIL import Image
@@ -27,19 +26,14 @@ if TYPE_CHECKING:
 _FRAMES_PER_SECOND = 12
 
 
-def orbit(
-    scene_path: str | os.PathLike[str],
-    frames: int,
-    parameters: Mapping[str, str] | None = None,
-    materials: Materials | None = None,
-) -> list[tuple[float, ...]]:
+def orbit(scene_file: SceneFile, frames: int) -> list[tuple[float, ...]]:
     """Return the motions of the first camera for one orbit, counterclockwise as seen from above.
 
     Frame k rotates it by 360° k/`frames` about the coordinate axis closest to its up vector, through the point on its
     line of sight that is closest to the centre of the scene's bounding box. Each motion is an affine map of world
-    space; the first is the identity. `load_spectral_scene` takes them; parameters, materials and errors are as there.
+    space; the first is the identity. For errors see `SceneFile.load`.
     """
-    scene = load_spectral_scene(scene_path, width=1, height=1, parameters=parameters, materials=materials)
+    scene = replace(scene_file, size=(1, 1)).load()
     target, up = _view(scene)
     motions = []
     for k in range(frames):

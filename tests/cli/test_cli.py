@@ -22,7 +22,7 @@ from mitsuba_diffraction.cli import _CtrlC, main
 from mitsuba_diffraction.cli.arguments import scene_parameters
 from mitsuba_diffraction.errors import RequestError
 from mitsuba_diffraction.progress import log_lines
-from mitsuba_diffraction.render import passes
+from mitsuba_diffraction.render.scene_file import SceneFile
 from mitsuba_diffraction.render.spectral_image import SpectralImage
 
 # So shallow that scalar theory holds: a warning would appear in whichever test is the first.
@@ -535,7 +535,7 @@ def test_the_first_message_comes_before_the_scene_is_loaded(monkeypatch, capfd):
         raise KeyboardInterrupt
 
     Path("scene.xml").write_text(SCENE)
-    monkeypatch.setattr(passes, "load_spectral_scene", interrupted)
+    monkeypatch.setattr(SceneFile, "load", interrupted)
     monkeypatch.setattr(sys, "argv", ["mitsuba-diffraction", "render", "scene.xml"])
     with pytest.raises(SystemExit):
         main()
@@ -611,14 +611,14 @@ def test_an_interrupt_inside_a_plugin_is_not_blamed_on_the_scene(command):
 def test_an_interrupt_swallowed_by_the_loader_ends_the_rendering(command, monkeypatch):
     """As C++ code and the garbage collector may do while the scene is loaded."""
 
-    load = passes.load_spectral_scene
+    load = SceneFile.load
 
     def ignoring(*args, **kwargs):
         with contextlib.suppress(KeyboardInterrupt):
             signal.raise_signal(signal.SIGINT)
         return load(*args, **kwargs)
 
-    monkeypatch.setattr(passes, "load_spectral_scene", ignoring)
+    monkeypatch.setattr(SceneFile, "load", ignoring)
     Path("scene.xml").write_text(SCENE)
     code, _, err = command("render scene.xml --spp 1")
     assert code == 130

@@ -19,7 +19,7 @@ from mitsuba_diffraction.files.writing import is_intact, refuse_unwritable, seal
 from mitsuba_diffraction.inverse_design import Design, makers, output
 from mitsuba_diffraction.inverse_design.plate import Plate
 from mitsuba_diffraction.inverse_design.target import wanted_fractions
-from mitsuba_diffraction.render.parsed_scene import files_of_scene
+from mitsuba_diffraction.render.scene_file import SceneFile
 from mitsuba_diffraction.render.spectral_image import SpectralImage, save_preview
 from mitsuba_diffraction.render.turntable import save_animation
 from mitsuba_diffraction.spectrum import exr
@@ -90,9 +90,9 @@ RENDER = "render u.xml --spp 1 --width 2"
 
 
 def test_a_scene_names_files(folder):
-    named = {os.path.relpath(path, folder) for path in files_of_scene("u.xml")}
+    named = {os.path.relpath(path, folder) for path in SceneFile("u.xml").files()}
     assert named == {"u.xml", "u.exr", "tex.png", "lights/sky.xml"}
-    named = {os.path.relpath(path, folder) for path in files_of_scene("u.xml", {"spectrum": "scan.toml"})}
+    named = {os.path.relpath(path, folder) for path in SceneFile("u.xml", {"spectrum": "scan.toml"}).files()}
     assert named == {"u.xml", "scan.toml", "scan.png", "tex.png", "lights/sky.xml"}
 
 

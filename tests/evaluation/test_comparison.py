@@ -19,6 +19,7 @@ from mitsuba_diffraction.evaluation.comparison.quirk_shares import quirk_shares
 from mitsuba_diffraction.evaluation.realtime_shader.evaluate import VARIANTS
 from mitsuba_diffraction.evaluation.realtime_shader.quirks import Quirks
 from mitsuba_diffraction.optics.color import delta_E, spectrum_to_XYZ
+from mitsuba_diffraction.render.scene_file import SceneFile
 from mitsuba_diffraction.render.scene_film import channel_wavelengths, channel_weights
 
 # A sphere above a plate, with a pigment; broad lobes, so that small pictures resolve them.
@@ -439,8 +440,8 @@ def test_the_same_seed_gives_the_same_numbers(llvm, folder):
 
 def test_lights_that_the_shader_supports_are_found():
     scene = Path(__file__).parents[2] / "scenes" / "xenopeltis_sphere.xml"
-    assert supported_lights(scene) == ("bulb", "parallel")
-    assert supported_lights(scene, {"light": "bulb"}) is None
+    assert supported_lights(SceneFile(scene)) == ("bulb", "parallel")
+    assert supported_lights(SceneFile(scene, {"light": "bulb"})) is None
 
 
 @pytest.mark.slow

@@ -11,6 +11,7 @@ from test_comparison import GRATING, SUN, write
 import mitsuba_diffraction  # noqa: F401 (settles which LLVM is used before a variant is set)
 from mitsuba_diffraction.evaluation.comparison.series import study
 from mitsuba_diffraction.render import render
+from mitsuba_diffraction.render.scene_file import SceneFile
 
 REQUESTED = "".join(f'<string name="{name}" value="${name}"/>' for name in ("representation", "terms", "heights_from"))
 ORIGINS = ("mean", "lowest")
@@ -50,13 +51,13 @@ def test_the_error_of_the_picture_falls_to_that_of_slices(llvm, tmp_path):
 
     # The same from the pictures of `render`, whose random numbers are others; it is told to accept the error.
     scene.write_text(scene.read_text().replace(REQUESTED, REQUESTED + '<float name="tolerance" value="$tolerance"/>'))
-    names = "representation", "terms", "tolerance"
-    wanted, other = (
-        render(
-            scene, spp=512, width=16, parameters={"heights_from": "mean", **dict(zip(names, values, strict=True))}
-        ).radiance.astype(float)[found.shown]
-        for values in (("slices", "auto", "0.01"), ("taylor", "2", "10"))
-    )  # fmt: skip
+    files = (
+        SceneFile(
+            scene, {"heights_from": "mean", "representation": kind, "terms": n, "tolerance": error}, size=(16, None)
+        )
+        for kind, n, error in (("slices", "auto", "0.01"), ("taylor", "2", "10"))
+    )
+    wanted, other = (render(file, spp=512).radiance.astype(float)[found.shown] for file in files)
     assert np.abs(other - wanted).sum() / wanted.sum() == pytest.approx(mean[0], rel=0.2)
 
 

@@ -12,7 +12,7 @@ from bsdf_support import bitmap, grating, uniform, use
 import mitsuba_diffraction  # noqa: F401 (settles which LLVM is used before a variant is set)
 from mitsuba_diffraction.render import scene as scene_module
 from mitsuba_diffraction.render.film import trace_pass
-from mitsuba_diffraction.render.scene import load_spectral_scene
+from mitsuba_diffraction.render.scene_file import SceneFile
 from mitsuba_diffraction.render.scene_film import channel_weights
 
 SUN = {"type": "directional", "direction": [0, 0.6, -0.8], "irradiance": uniform(1.0)}
@@ -390,7 +390,7 @@ SCENE = """<scene version="3.0.0">
 def test_passes_do_not_depend_on_threads_and_agree_with_mitsubas_film(llvm, tmp_path):
     path = tmp_path / "scene.xml"
     path.write_text(SCENE)
-    built = load_spectral_scene(path)
+    built = SceneFile(path).load()
     threads = dr.thread_count()
     try:
         passes = []
@@ -449,7 +449,7 @@ def test_both_halves_draw_the_lines_of_a_lamp(llvm, tmp_path, monkeypatch):
     path.write_text(SCENE.replace("</emitter>", line))
 
     def pictures():
-        built = load_spectral_scene(path)
+        built = SceneFile(path).load()
         eye, _ = built.integrator().parts(built, built.sensors()[0])
         for k in range(8):
             whole = trace_pass(built, 32, k)[..., :-1].sum((0, 1, 2))

@@ -9,7 +9,7 @@ import ready_spectra
 from mitsuba_diffraction.energy.table import EnergyTable
 from mitsuba_diffraction.precomputation.recipe import READY_SPECTRA, Recipe
 from mitsuba_diffraction.precomputation.spectra import load_spectrum
-from mitsuba_diffraction.render.scene import load_spectral_scene
+from mitsuba_diffraction.render.scene_file import SceneFile
 
 ROOT = Path(__file__).parents[2]
 
@@ -42,5 +42,5 @@ def test_first_pictures_compute_no_spectrum(scene, tmp_path, monkeypatch, llvm):
     monkeypatch.setenv("MITSUBA_DIFFRACTION_CACHE", str(tmp_path))
     monkeypatch.setattr(Recipe, "build", lambda *_: pytest.fail("a spectrum was computed"))
     monkeypatch.setattr(EnergyTable, "of", lambda *_: pytest.fail("a table of E was computed"))
-    load_spectral_scene(ROOT / "scenes" / f"{scene}.xml", width=4, height=4)
+    SceneFile(ROOT / "scenes" / f"{scene}.xml", size=(4, 4)).load()
     assert not list(tmp_path.iterdir())

@@ -19,7 +19,7 @@ from mitsuba_diffraction.optics.color import spectrum_to_XYZ
 from mitsuba_diffraction.render import SpectralImage, film, passes, render
 from mitsuba_diffraction.render.film import LightOfBands, bands_of, trace_pass
 from mitsuba_diffraction.render.passes import BandedImage, Interrupted, trace_locally
-from mitsuba_diffraction.render.scene import load_spectral_scene
+from mitsuba_diffraction.render.scene_file import SceneFile
 from mitsuba_diffraction.render.scene_film import channel_wavelengths
 from mitsuba_diffraction.render.spectral_image import save_preview
 
@@ -81,7 +81,7 @@ def three_bands(monkeypatch):
 
 
 def test_bands_cover_the_film(monkeypatch):
-    built = load_spectral_scene(write_scene())
+    built = SceneFile(write_scene()).load()
     assert bands_of(built) == ((0, 10),)
     for pixels, count in ((119, 2), (40, 3), (12, 10), (1, 10)):
         monkeypatch.setattr(film, "BAND_PIXELS", pixels)
@@ -89,7 +89,7 @@ def test_bands_cover_the_film(monkeypatch):
         assert len(bands) == count
         assert [row for first, end in bands for row in range(first, end)] == list(range(10))
     # Mitsuba's own film takes whole pictures only.
-    assert bands_of(load_spectral_scene(write_scene("prb"))) == ((0, 10),)
+    assert bands_of(SceneFile(write_scene("prb")).load()) == ((0, 10),)
 
 
 @pytest.mark.parametrize(
@@ -97,7 +97,7 @@ def test_bands_cover_the_film(monkeypatch):
     [("path", "multijitter"), pytest.param("diffraction_path", "independent", marks=pytest.mark.slow)],
 )
 def test_a_picture_in_bands_has_the_expectation_of_one_in_a_single_piece(integrator, sampler, three_bands):
-    built = load_spectral_scene(write_scene(integrator, sampler))
+    built = SceneFile(write_scene(integrator, sampler)).load()
     bands = bands_of(built)
     light = LightOfBands(bands)
 
@@ -115,7 +115,7 @@ def test_a_picture_in_bands_has_the_expectation_of_one_in_a_single_piece(integra
 
 
 def test_light_of_bands_is_that_of_the_whole_bit_for_bit(three_bands):
-    built = load_spectral_scene(write_scene("diffraction_path"))
+    built = SceneFile(write_scene("diffraction_path")).load()
     integrator, bands = built.integrator(), bands_of(built)
 
     class LightAlone(mi.SamplingIntegrator):

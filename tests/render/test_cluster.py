@@ -18,6 +18,7 @@ import mitsuba_diffraction  # noqa: F401 (settles which LLVM is used before a va
 from mitsuba_diffraction.render import SpectralImage, cluster, passes, render
 from mitsuba_diffraction.render.cluster import trace_on
 from mitsuba_diffraction.render.passes import Interrupted
+from mitsuba_diffraction.render.scene_file import SceneFile
 
 distributed = pytest.importorskip("distributed")
 
@@ -140,16 +141,21 @@ def test_failures_of_a_worker_are_one_line(threads_of_this_process, monkeypatch,
     assert (code, out) == (1, "")
     assert err.splitlines()[-1] == "mitsuba-diffraction: error: rendering failed: no luck"
 
-    def miss(job):
-        raise FileNotFoundError("scene.xml: no such file")
+    # A worker has the absolute path.
+    load, digest = SceneFile.load, SceneFile.digest
+
+    def miss(scene_file):
+        if os.path.isabs(scene_file.path):
+            raise FileNotFoundError("scene.xml: no such file")
+        return load(scene_file)
 
     with monkeypatch.context() as only_here:
-        only_here.setattr(passes.Job, "load", miss)
+        only_here.setattr(SceneFile, "load", miss)
         cluster.scene_of.cache_clear()
         code, out, err = command(line)
     assert (code, out) == (1, "")
     assert err.splitlines()[-1].endswith("error: a worker cannot load the scene: scene.xml: no such file")
-    monkeypatch.setattr(cluster, "scene_digest", lambda *arguments: "another")
+    monkeypatch.setattr(SceneFile, "digest", lambda file: "another" if os.path.isabs(file.path) else digest(file))
     cluster.scene_of.cache_clear()
     code, out, err = command(line)
     assert (code, out) == (1, "")

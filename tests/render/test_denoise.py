@@ -11,8 +11,7 @@ from PIL import Image
 
 import mitsuba_diffraction  # noqa: F401 (settles which LLVM is used before a variant is set)
 from mitsuba_diffraction.optics.color import XYZ_to_linear_sRGB, into_gamut, matching_functions
-from mitsuba_diffraction.render import denoise, passes
-from mitsuba_diffraction.render import scene as loading
+from mitsuba_diffraction.render import denoise, passes, scene_file
 from mitsuba_diffraction.render.denoise import Guides, denoised, denoised_picture, guides, is_requested
 
 SCENE = """<scene version="3.0.0"><integrator type="direct"/>
@@ -119,17 +118,24 @@ def test_missing_requirements_are_reported_before_the_work(command, tmp_path, mo
     assert sorted(p.name for p in tmp_path.iterdir()) == ["scene.xml"]
 
 
-def test_a_scene_is_loaded_once_and_its_guides_are_tried_before_the_first_pass(command, tmp_path, monkeypatch):
+def test_a_scene_is_parsed_and_loaded_once_and_its_guides_are_tried_before_the_first_pass(
+    command, tmp_path, monkeypatch
+):
     monkeypatch.chdir(tmp_path)
     Path("scene.xml").write_text(SCENE)
     line = "render scene.xml --denoise --variant llvm_ad_spectral --spp 1 --width 16"
     events = []
-    for module, name in ((loading, "instantiated"), (denoise, "guides"), (passes, "trace_pass")):
+    for module, name in (
+        (mi.parser, "parse_file"),
+        (scene_file, "instantiated"),
+        (denoise, "guides"),
+        (passes, "trace_pass"),
+    ):
         call = getattr(module, name)
         monkeypatch.setattr(module, name, lambda *a, name=name, call=call, **k: (events.append(name), call(*a, **k))[1])
     code, _, err = command(line)
     assert code == 0, err
-    assert events == ["instantiated", "guides", "trace_pass", "guides"]
+    assert events == ["parse_file", "instantiated", "guides", "trace_pass", "guides"]
 
 
 ASKS = SCENE.replace('<integrator type="direct"/>', '<default name="denoise" value="true"/><integrator type="direct"/>')

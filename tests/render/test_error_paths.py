@@ -13,7 +13,7 @@ from test_render import CONSTANT, SENSOR, SPHERE, write_scene
 from mitsuba_diffraction.errors import RequestError
 from mitsuba_diffraction.render import cluster, denoise, film, passes, render
 from mitsuba_diffraction.render.passes import split
-from mitsuba_diffraction.render.scene import load_spectral_scene
+from mitsuba_diffraction.render.scene_file import SceneFile
 from mitsuba_diffraction.render.spectral_image import SpectralImage
 
 CAMERA = SENSOR.format(film='<film type="hdrfilm"><integer name="width" value="{}"/></film>')
@@ -51,16 +51,16 @@ def one_line(message, call, error=RequestError):
 def test_scenes_that_cannot_be_rendered(llvm, tmp_path, message, content):
     path = tmp_path / "scene.xml"
     path.write_text(content)
-    one_line(message, lambda: load_spectral_scene(path))
+    one_line(message, lambda: SceneFile(path).load())
 
 
 def test_requests_that_cannot_be_met(llvm, tmp_path, monkeypatch):
     path = write_scene(tmp_path, CONSTANT + GLASS)
-    one_line("width: got 0, wanted a positive number of pixels", lambda: load_spectral_scene(path, width=0))
+    one_line("width: got 0, wanted a positive number of pixels", lambda: SceneFile(path, size=(0, None)).load())
     grating = {"glass": {"profile": "blazed", "period": 2.5, "depth": 0.25}}
-    one_line("in the place of a BSDF that transmits light", lambda: load_spectral_scene(path, materials=grating))
+    one_line("in the place of a BSDF that transmits light", lambda: SceneFile(path, materials=grating).load())
     one_line("spp: got 0, wanted a positive number", lambda: render(path, spp=0))
-    one_line("wanted at most .* for so large a picture", lambda: split(load_spectral_scene(path), 10**14))
+    one_line("wanted at most .* for so large a picture", lambda: split(SceneFile(path).load(), 10**14))
     monkeypatch.setattr(film, "available_memory", lambda: 1000)
     one_line("film: got 8 × 8 pixels, which take .* that are available", lambda: render(path, spp=1))
     monkeypatch.setitem(sys.modules, "pyoidn", None)
@@ -69,7 +69,7 @@ def test_requests_that_cannot_be_met(llvm, tmp_path, monkeypatch):
     one_line("a Dask cluster needs the package distributed", lambda: cluster.trace_on("tcp://a:1"), RuntimeError)
     one_line("wanted names of files and folders in UTF-8", lambda: render(tmp_path / "s\udce9.xml", spp=1))
     use("scalar_rgb")
-    one_line("variant: got 'scalar_rgb', wanted a spectral one", lambda: load_spectral_scene(path))
+    one_line("variant: got 'scalar_rgb', wanted a spectral one", lambda: SceneFile(path).load())
 
 
 def test_integrators_whose_samples_are_correlated_are_named(llvm, tmp_path, caplog):

@@ -6,7 +6,8 @@ from pathlib import Path
 import mitsuba as mi
 import pytest
 
-from mitsuba_diffraction.render.scene import load_spectral_scene, warn_of_gratings
+from mitsuba_diffraction.render.scene import warn_of_gratings
+from mitsuba_diffraction.render.scene_file import SceneFile
 
 SCENE = """<scene version="3.0.0"><integrator type="path"/>
 <sensor type="perspective"><transform name="to_world"><lookat origin="0,0,{eye}" target="0,0,0" up="0,1,0"/></transform>
@@ -31,7 +32,7 @@ def test_an_opaque_grating_lit_or_seen_from_below_is_logged(tmp_path, caplog, ey
     mi.set_variant("llvm_ad_spectral")
     (tmp_path / "s.xml").write_text(SCENE.format(eye=eye, light=light, kind=kind))
     with caplog.at_level(logging.WARNING, logger="mitsuba_diffraction.render.scene"):
-        warn_of_gratings(load_spectral_scene(tmp_path / "s.xml", width=8, height=8))
+        warn_of_gratings(SceneFile(tmp_path / "s.xml", size=(8, 8)).load())
     messages = [record.getMessage() for record in caplog.records]
     assert len(messages) == bool(message)
     assert all(message in logged and "transmission=sheet" in logged for logged in messages)

@@ -19,7 +19,6 @@ import mitsuba_diffraction  # noqa: F401 (settles which LLVM is used before a va
 from mitsuba_diffraction.files.writing import exclusive
 from mitsuba_diffraction.optics.color import spectrum_to_XYZ
 from mitsuba_diffraction.render import SpectralImage, passes, render
-from mitsuba_diffraction.render.parsed_scene import scene_digest
 from mitsuba_diffraction.render.passes import (
     Accumulation,
     Interrupted,
@@ -27,7 +26,7 @@ from mitsuba_diffraction.render.passes import (
     load_checkpoint,
     save_checkpoint,
 )
-from mitsuba_diffraction.render.scene import load_spectral_scene
+from mitsuba_diffraction.render.scene_file import SceneFile
 from mitsuba_diffraction.render.scene_film import channel_wavelengths
 from mitsuba_diffraction.render.spectral_image import save_preview, stored_digest
 from mitsuba_diffraction.render.turntable import orbit
@@ -217,22 +216,22 @@ def test_a_checkpoint_that_another_process_writes_is_refused():
 
 
 @pytest.mark.parametrize(
-    "change",
+    ("scene", "change"),
     [
-        {"spp": 8},
-        {"seed": 1},
-        {"width": 12},
-        {"parameters": {"red": "0.6"}},
-        {"until_error": 0.1},
-        {"motion": (1.0, 0, 0, 0.5, 0, 1, 0, 0, 0, 0, 1, 0, 0, 0, 0, 1)},
+        ({}, {"spp": 8}),
+        ({}, {"seed": 1}),
+        ({"size": (12, None)}, {}),
+        ({"parameters": {"red": "0.6"}}, {}),
+        ({}, {"until_error": 0.1}),
+        ({"motion": (1.0, 0, 0, 0.5, 0, 1, 0, 0, 0, 0, 1, 0, 0, 0, 0, 1)}, {}),
     ],
 )
-def test_checkpoints_of_other_renderings_are_refused(change):
+def test_checkpoints_of_other_renderings_are_refused(scene, change):
     with pytest.raises(Interrupted):
         render("scene.xml", spp=7, checkpoint="c", tracer=stop_after(2))
     before = Path("c").read_bytes()
     with pytest.raises(ValueError, match="c: of another rendering"):
-        render("scene.xml", **{"spp": 7, "checkpoint": "c", **change})
+        render(SceneFile("scene.xml", **scene), **{"spp": 7, "checkpoint": "c", **change})
     assert Path("c").read_bytes() == before
 
 
@@ -244,7 +243,7 @@ def test_the_digest_depends_on_the_content_of_a_scene_and_its_files(tmp_path):
         folder.mkdir(exist_ok=True)
         Image.new("L", (2, 2), grey).save(folder / "grey.png")
         (folder / "scene.xml").write_text(text)
-        return scene_digest(folder / "scene.xml")
+        return SceneFile(folder / "scene.xml").digest()
 
     first = digest(tmp_path / "a", 100)
     assert digest(tmp_path / "b", 100) == first
@@ -261,24 +260,24 @@ def test_the_digest_depends_on_the_content_of_a_scene_and_its_files(tmp_path):
     (tmp_path / "a" / "more.xml").write_text(included)
     text = SCENE.replace("RFILTER", "box").replace("</scene>", '<include filename="more.xml"/></scene>')
     (tmp_path / "a" / "scene.xml").write_text(text)
-    first = scene_digest(tmp_path / "a" / "scene.xml")
+    first = SceneFile(tmp_path / "a" / "scene.xml").digest()
     for old, new in (("0.5", "0.6"), ('x="0.1"', 'x="0.1000001"'), ("0.3", "0.3000001")):
         assert old in included
         (tmp_path / "a" / "more.xml").write_text(included.replace(old, new))
-        assert scene_digest(tmp_path / "a" / "scene.xml") != first, new
+        assert SceneFile(tmp_path / "a" / "scene.xml").digest() != first, new
     (tmp_path / "a" / "more.xml").write_text(included)
-    assert scene_digest(tmp_path / "a" / "scene.xml") == first
+    assert SceneFile(tmp_path / "a" / "scene.xml").digest() == first
     (tmp_path / "a" / "light.spd").write_text("400 1\n700 3\n")
-    assert scene_digest(tmp_path / "a" / "scene.xml") != first
+    assert SceneFile(tmp_path / "a" / "scene.xml").digest() != first
 
     grating = '<bsdf type="diffraction_grating"><string name="filename" value="recipe.toml"/></bsdf>'
     Path("scene.xml").write_text(SCENE.replace("RFILTER", "box").replace("</scene>", f"{grating}</scene>"))
     recipe = '[surface]\nscan = "scan.npy"\npixel_size = 0.1\n'
     Path("recipe.toml").write_text(recipe)
     np.save("scan.npy", np.zeros((4, 4)))
-    first = scene_digest("scene.xml")
+    first = SceneFile("scene.xml").digest()
     np.save("scan.npy", np.ones((4, 4)))
-    assert scene_digest("scene.xml") != first
+    assert SceneFile("scene.xml").digest() != first
 
 
 @pytest.mark.parametrize("damage", ["cut", "changed", "encrypted", "text", "empty", "other", "incomplete"])
@@ -488,7 +487,7 @@ def test_an_interrupt_before_the_first_pass_writes_nothing(command, monkeypatch)
     def interrupted(*arguments, **named):
         raise KeyboardInterrupt
 
-    monkeypatch.setattr(passes, "load_spectral_scene", interrupted)
+    monkeypatch.setattr(SceneFile, "load", interrupted)
     code, out, err = command(LINE)
     assert (code, out) == (130, "")
     assert err.strip() == "mitsuba-diffraction: interrupted: nothing was written"
@@ -585,12 +584,12 @@ def test_a_checkpoint_is_the_old_one_until_the_new_one_is_whole(monkeypatch):
 
 
 def camera(motion, scene="scene.xml"):
-    sensor = load_spectral_scene(scene, motion=motion).sensors()[0]
+    sensor = SceneFile(scene, motion=motion).load().sensors()[0]
     return np.ravel(np.array(sensor.world_transform().matrix)).reshape(4, 4)
 
 
 def test_the_orbit_runs_around_the_target():
-    motions = orbit("scene.xml", 4)
+    motions = orbit(SceneFile("scene.xml"), 4)
     np.testing.assert_allclose(camera(motions[0]), camera(None), atol=1e-6)
     for motion, origin in zip(motions[1:], ("4,0,2", "0,4,2", "-4,0,2"), strict=True):
         Path("moved.xml").write_text(SCENE.replace("RFILTER", "box").replace("0,-4,2", origin))
@@ -604,19 +603,19 @@ def test_parameters_and_matrices_place_the_orbit():
             "<integrator", '<default name="x" value="0"/><integrator'
         )
     )
-    assert orbit("scene.xml", 3, {"x": "1"}) != orbit("scene.xml", 3)
-    np.testing.assert_allclose(camera(orbit("scene.xml", 2)[1])[:3, 3], [0, 4, 2], atol=1e-6)
+    assert orbit(SceneFile("scene.xml", {"x": "1"}), 3) != orbit(SceneFile("scene.xml"), 3)
+    np.testing.assert_allclose(camera(orbit(SceneFile("scene.xml"), 2)[1])[:3, 3], [0, 4, 2], atol=1e-6)
     # Without a lookat: the same axis.
     matrix = " ".join(f"{number:.9g}" for number in camera(None).ravel())
     lookat = '<lookat origin="0,-4,2" target="0,0,0.5" up="0,0,1"/>'
     Path("scene.xml").write_text(text.replace(lookat, f'<matrix value="{matrix}"/>'))
-    np.testing.assert_allclose(camera(orbit("scene.xml", 2)[1])[:3, 3], [0, 4, 2], atol=1e-5)
+    np.testing.assert_allclose(camera(orbit(SceneFile("scene.xml"), 2)[1])[:3, 3], [0, 4, 2], atol=1e-5)
 
 
 def test_the_orbit_takes_any_xml_that_mitsuba_takes():
     strange = SCENE.replace("RFILTER", "box").replace("<integrator", "<!-- caf\xe9 --><integrator", 1)
     Path("scene.xml").write_bytes(strange.replace('type="path"', 'type="path" id="a & b"', 1).encode("latin-1"))
-    assert len(orbit("scene.xml", 3)) == 3
+    assert len(orbit(SceneFile("scene.xml"), 3)) == 3
 
 
 def test_a_turntable_writes_frames_and_an_animation_and_resumes(command, monkeypatch):
@@ -633,9 +632,9 @@ def test_a_turntable_writes_frames_and_an_animation_and_resumes(command, monkeyp
     assert files() == {"scene.xml", "out.webp", "out.gif", "out.mp4", *expected}
     assert Path("out_000.exr").stat().st_mtime_ns == first
     assert len({line.split("exposed by ")[1] for line in out.splitlines() if "exposure" in line}) == 1
-    for number, motion in enumerate(orbit("scene.xml", 3)):
+    for number, motion in enumerate(orbit(SceneFile("scene.xml"), 3)):
         picture = SpectralImage.load(f"out_{number:03d}.exr")
-        np.testing.assert_array_equal(picture.radiance, render("scene.xml", spp=2, motion=motion).radiance)
+        np.testing.assert_array_equal(picture.radiance, render(SceneFile("scene.xml", motion=motion), spp=2).radiance)
     stills = [np.asarray(Image.open(f"out_{number:03d}.png"), dtype=float) for number in range(3)]
     for name in ("out.webp", "out.gif"):
         with Image.open(name) as animation:

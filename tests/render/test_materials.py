@@ -12,8 +12,8 @@ from bsdf_support import made_up
 
 from mitsuba_diffraction.cli.arguments import materials_of
 from mitsuba_diffraction.render import render
-from mitsuba_diffraction.render.parsed_scene import files_of_scene, parsed, scene_digest
-from mitsuba_diffraction.render.scene import has_uvs, load_spectral_scene, warn_of_gratings
+from mitsuba_diffraction.render.scene import has_uvs, warn_of_gratings
+from mitsuba_diffraction.render.scene_file import SceneFile
 
 MIRROR = {"profile": "blazed", "period": 2.0, "depth": 0.2, "material": "none", "conserve_energy": False}
 PLAIN = "".join(
@@ -84,7 +84,7 @@ def exported(llvm, tmp_path):
 
 def test_a_replaced_material_renders_as_if_the_scene_had_the_grating(exported):
     wanted = render(exported(GRATING), spp=2).radiance
-    found = render(path := exported(), spp=2, materials={"mat-Disc": MIRROR}).radiance
+    found = render(SceneFile(path := exported(), materials={"mat-Disc": MIRROR}), spp=2).radiance
     np.testing.assert_array_equal(found, wanted)
     before = render(path, spp=2).radiance
     assert np.abs(found - before).max() > 0.1
@@ -124,7 +124,7 @@ def tree(state, node):
 
 def parsed_disc(path, materials=None):
     """The BSDF of the disc of an exported scene as it is parsed, see `tree`."""
-    with parsed(path, None, materials) as (config, state):
+    with SceneFile(path, materials=materials).parsed() as (config, state):
         mi.parser.transform_resolve(config, state)
         (disc,) = [node for node in state.nodes if node.props.id() == "mat-Disc"]
         return tree(state, disc)
@@ -147,7 +147,7 @@ def test_the_grating_is_put_inside_of_what_wraps_a_material(exported, wrapper, v
     part = '<ref id="shared"/>' if referenced else pigment
     path.write_text(before.replace("BSDF", text.replace("PART", part) + shared))
     assert parsed_disc(path, {"mat-Disc": values}) == wanted
-    with parsed(path, None, {"mat-Disc": values}) as (_, state):
+    with SceneFile(path, materials={"mat-Disc": values}).parsed() as (_, state):
         (kept,) = [node.props for node in state.nodes if node.props.id() == "shared"]
         assert kept.plugin_name() == "diffuse"
 
@@ -163,7 +163,7 @@ def test_a_grating_that_transmits_light_is_on_no_side_of_a_mask(exported):
     )
     assert plugins.count("twosided") == 0
     assert {"mask", "normalmap", "diffraction_grating"} <= set(plugins)
-    load_spectral_scene(path, materials={"mat-Disc": glass})
+    SceneFile(path, materials={"mat-Disc": glass}).load()
 
 
 def test_the_opacity_of_a_masked_material_remains(exported):
@@ -174,7 +174,7 @@ def test_the_opacity_of_a_masked_material_remains(exported):
     for opacity in (1, 0.3):
         mask = f'<bsdf type="mask" id="mat-Disc"><float name="opacity" value="{opacity}"/><bsdf type="diffuse"/></bsdf>'
         path.write_text(text.replace(DISC, mask))
-        image = render(path, spp=1024, width=16, materials={"mat-Disc": MIRROR})
+        image = render(SceneFile(path, materials={"mat-Disc": MIRROR}, size=(16, None)), spp=1024)
         means.append(image.radiance[4:8, 6:10].mean())
     # The standard error of 0.3 of 16384 samples is 1.2 %.
     assert means[1] == pytest.approx(0.3 * means[0], rel=0.05)
@@ -183,9 +183,9 @@ def test_the_opacity_of_a_masked_material_remains(exported):
 def test_the_replaced_bsdf_remains_below_a_dielectric(exported):
     below = PLAIN.replace('<string name="material" value="none"/>', PRINCIPLED.replace('bsdf"', 'base"', 1))
     wanted = render(exported(f'<bsdf type="diffraction_grating" name="bsdf">{below}</bsdf>'), spp=2).radiance
-    found = render(path := exported(), spp=2, materials={"mat-Disc": DIELECTRIC}).radiance
+    found = render(SceneFile(path := exported(), materials={"mat-Disc": DIELECTRIC}), spp=2).radiance
     np.testing.assert_array_equal(found, wanted)
-    bare = render(path, spp=2, materials={"mat-Disc": {**DIELECTRIC, "base": "none"}}).radiance
+    bare = render(SceneFile(path, materials={"mat-Disc": {**DIELECTRIC, "base": "none"}}), spp=2).radiance
     assert found.mean() > 2 * bare.mean()
 
 
@@ -209,7 +209,7 @@ def test_a_base_remains_where_light_reaches_it(exported, tmp_path, values, kept)
         text = f'[surface]\nprofile = "blazed"\n[spectrum]\ntheory = "{theory}"\nint_ior = 1.5\n'
         (tmp_path / f"{theory}.toml").write_text(text if theory == "rigorous" else text.replace("int_ior = 1.5\n", ""))
     made_up().save(tmp_path / "rigorous.exr")
-    with parsed(path, None, {"mat-Disc": {"profile": "blazed", **values}}) as (_, state):
+    with SceneFile(path, materials={"mat-Disc": {"profile": "blazed", **values}}).parsed() as (_, state):
         (grating,) = [node.props for node in state.nodes if node.props.plugin_name() == "diffraction_grating"]
         assert ("base" in grating) == kept
 
@@ -226,9 +226,9 @@ def test_a_dielectric_in_the_place_of_glass_is_refused(exported, glass):
     path = exported()
     path.write_text(path.read_text().replace("</scene>", glass.replace("<bsdf ", '<bsdf id="glass" ', 1) + "</scene>"))
     with pytest.raises(ValueError, match=r"material glass: got a dielectric .* wanted transmission=sheet or interface"):
-        load_spectral_scene(path, materials={"glass": {"profile": "blazed"}})
+        SceneFile(path, materials={"glass": {"profile": "blazed"}}).load()
     for values in ({"transmission": "sheet"}, {"material": "Al"}, {"base": "none"}):
-        with parsed(path, None, {"glass": {"profile": "blazed", **values}}):
+        with SceneFile(path, materials={"glass": {"profile": "blazed", **values}}).parsed():
             pass
 
 
@@ -247,7 +247,7 @@ def test_light_cast_by_gratings_is_traced_where_it_can_be(exported, parameter, b
     path.write_text(text.replace(film, film + border))
 
     def integrator(**materials):
-        found = load_spectral_scene(path, **materials).integrator()
+        found = SceneFile(path, **materials).load().integrator()
         return f"{type(found).__name__} {found}"
 
     assert "PathIntegrator" in integrator()
@@ -264,7 +264,7 @@ def test_light_cast_by_gratings_is_traced_where_it_can_be(exported, parameter, b
     ids=["twosided", "in a twosided", "in a blend"],
 )
 def test_a_material_is_replaced_wherever_it_is(exported, disc, name, kept):
-    shapes = load_spectral_scene(exported(disc), materials={name: MIRROR}).shapes()
+    shapes = SceneFile(exported(disc), materials={name: MIRROR}).load().shapes()
     (grating,) = [text for text in (str(shape.bsdf()) for shape in shapes) if "DiffractionGrating[" in text]
     assert kept in grating
 
@@ -272,13 +272,13 @@ def test_a_material_is_replaced_wherever_it_is(exported, disc, name, kept):
 def test_a_transmitting_grating_replaces_a_twosided(exported):
     glass = {**MIRROR, "transmission": "interface", "int_ior": 1.5}
     del glass["material"]
-    scene = load_spectral_scene(exported(), materials={"mat-Disc": glass})
+    scene = SceneFile(exported(), materials={"mat-Disc": glass}).load()
     assert any(str(shape.bsdf()).startswith("DiffractionGrating[") for shape in scene.shapes())
 
 
 def test_an_unknown_id_is_refused_with_the_known_ids(exported):
     with pytest.raises(ValueError, match=r"got the id 'Disc', the ids of BSDFs in the scene are mat-Disc, mat-Floor"):
-        load_spectral_scene(exported(), materials={"Disc": MIRROR})
+        SceneFile(exported(), materials={"Disc": MIRROR}).load()
 
 
 @pytest.mark.parametrize(
@@ -301,14 +301,14 @@ def test_wrong_parameters_are_refused_before_a_spectrum_is_computed(exported, mo
         "mitsuba_diffraction.precomputation.recipe.Recipe.cached", lambda *_: pytest.fail("a spectrum was computed")
     )
     with pytest.raises((ValueError, FileNotFoundError), match=text):
-        load_spectral_scene(exported(), materials={"mat-Floor": MIRROR, "mat-Disc": values})
+        SceneFile(exported(), materials={"mat-Floor": MIRROR, "mat-Disc": values}).load()
 
 
 def test_a_material_that_no_shape_has_is_logged(exported, caplog):
     path = exported()
     path.write_text(path.read_text().replace("</scene>", '<bsdf type="diffuse" id="mat-Spare"/></scene>'))
     with caplog.at_level(logging.WARNING, "mitsuba_diffraction"):
-        load_spectral_scene(path, materials={"mat-Disc": MIRROR, "mat-Spare": MIRROR})
+        SceneFile(path, materials={"mat-Disc": MIRROR, "mat-Spare": MIRROR}).load()
     messages = [record.getMessage() for record in caplog.records if "no shape" in record.getMessage()]
     assert messages == ["material mat-Spare: no shape uses the BSDF with that id, so the picture is unaffected"]
 
@@ -319,13 +319,13 @@ def test_a_misspelt_parameter_is_refused_with_a_material_too(exported):
         path.read_text().replace("</scene>", '<shape type="sphere"><float name="radiu" value="1"/></shape></scene>')
     )
     with pytest.raises(ValueError, match="radiu"):
-        load_spectral_scene(path, materials={"mat-Disc": MIRROR})
+        SceneFile(path, materials={"mat-Disc": MIRROR}).load()
 
 
 @pytest.mark.parametrize("uvs", [True, False])
 def test_a_grating_on_a_mesh_without_uvs_is_logged(exported, uvs, caplog):
     with caplog.at_level(logging.WARNING, "mitsuba_diffraction"):
-        warn_of_gratings(load_spectral_scene(exported(uvs=uvs), materials={"mat-Disc": MIRROR}))
+        warn_of_gratings(SceneFile(exported(uvs=uvs), materials={"mat-Disc": MIRROR}).load())
     messages = [record.getMessage() for record in caplog.records if "UVs" in record.getMessage()]
     assert len(messages) == (0 if uvs else 1)
     assert all(line.startswith("mat-Disc: on a mesh without UVs") for line in messages)
@@ -340,7 +340,7 @@ def test_uvs_are_found_by_the_name_of_either_mitsuba(name):
 def test_the_digest_of_a_scene_is_that_of_its_materials(exported):
     path = exported()
     other = {**MIRROR, "depth": 0.3}
-    digests = [scene_digest(path, materials=m) for m in (None, {"mat-Disc": MIRROR}, {"mat-Disc": other})]
+    digests = [SceneFile(path, materials=m).digest() for m in (None, {"mat-Disc": MIRROR}, {"mat-Disc": other})]
     assert len(set(digests)) == 3
 
 
@@ -407,8 +407,8 @@ def test_the_file_of_a_texture_belongs_to_the_scene(exported, tmp_path):
     digests = set()
     for value in (50, 100):
         mi.Bitmap(np.full((4, 4), value, np.uint8)).write(str(picture))
-        digests.add(scene_digest(path, materials=materials))
+        digests.add(SceneFile(path, materials=materials).digest())
     assert len(digests) == 2
-    assert picture in files_of_scene(path, materials=materials)
-    (shape,) = [s for s in load_spectral_scene(path, materials=materials).shapes() if "DiffractionG" in str(s.bsdf())]
+    assert picture in SceneFile(path, materials=materials).files()
+    (shape,) = [s for s in SceneFile(path, materials=materials).load().shapes() if "DiffractionG" in str(s.bsdf())]
     assert "height_scale = 0.392157 to 0.392157" in str(shape.bsdf())

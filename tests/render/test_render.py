@@ -18,8 +18,7 @@ from mitsuba_diffraction.optics.color import spectrum_to_linear_sRGB, spectrum_t
 from mitsuba_diffraction.render import film, passes, render
 from mitsuba_diffraction.render.denoise import guides
 from mitsuba_diffraction.render.film import trace_pass
-from mitsuba_diffraction.render.parsed_scene import files_of_scene
-from mitsuba_diffraction.render.scene import load_spectral_scene
+from mitsuba_diffraction.render.scene_file import SceneFile
 from mitsuba_diffraction.render.scene_film import channel_wavelengths, channel_weights
 from mitsuba_diffraction.render.scene_light import max_plausible_luminance
 from mitsuba_diffraction.render.spectral_image import save_preview
@@ -96,7 +95,7 @@ def test_a_spectrum_of_many_values_in_the_scene_is_no_file_name(llvm, tmp_path):
         <string name="wavelengths" value="{wavelengths}"/><string name="values" value="{values}"/>
         </spectrum></emitter>"""
     path = write_scene(tmp_path, lamp)
-    assert files_of_scene(path) == [path]
+    assert SceneFile(path).files() == [path]
     assert render(path, spp=64).radiance.mean() == pytest.approx(1, rel=0.05)
 
 
@@ -145,7 +144,7 @@ def test_line_of_a_lamp_and_daylight_have_the_radiance_of_the_closed_form(llvm, 
 
 
 def test_the_four_wavelengths_of_a_ray_are_spread_over_line_and_film(llvm, tmp_path):
-    sensor = load_spectral_scene(write_scene(tmp_path, WALL + LINE + CONSTANT)).sensors()[0]
+    sensor = SceneFile(write_scene(tmp_path, WALL + LINE + CONSTANT)).load().sensors()[0]
     drawn, _ = sensor.sample_wavelengths(dr.zeros(mi.SurfaceInteraction3f), (dr.arange(mi.Float, 1000) + 0.5) / 1000)
     drawn = np.sort(np.array(drawn), axis=0)
     in_line = np.abs(drawn - 546) < 1.3
@@ -161,7 +160,7 @@ def test_the_four_wavelengths_of_a_ray_are_spread_over_line_and_film(llvm, tmp_p
 
 @pytest.mark.parametrize("light", ['<emitter type="constant"/>', '<emitter type="sunsky"/>', CONSTANT])
 def test_wavelengths_of_daylight_are_drawn_by_the_response_of_the_film(llvm, tmp_path, light):
-    built = load_spectral_scene(write_scene(tmp_path, WALL + light))
+    built = SceneFile(write_scene(tmp_path, WALL + light)).load()
     drawn_from = np.array(mi.traverse(built.sensors()[0].film().sensor_response_function())["values"])
     fine = np.linspace(360, 830, drawn_from.size)
     expected = np.interp(fine, [360, *GRID, 830], [0, *channel_weights() / 5, 0])
@@ -225,7 +224,7 @@ def test_rendering_a_scene_again_compiles_nothing(llvm, tmp_path):
 
 
 def test_numbers_of_the_same_rays_come_from_one_kernel(llvm, tmp_path):
-    scene = load_spectral_scene(write_scene(tmp_path, SPHERE + CONSTANT))
+    scene = SceneFile(write_scene(tmp_path, SPHERE + CONSTANT)).load()
     for work in (max_plausible_luminance, guides):
         dr.kernel_history_clear()
         with dr.scoped_set_flag(dr.JitFlag.KernelHistory, True):
@@ -290,7 +289,7 @@ SIZES = {
 def test_passes_have_sizes_that_the_sampler_draws(llvm, tmp_path, kind, capfd):
     path = write_scene(tmp_path, CONSTANT, sensor=SENSOR.replace("independent", kind))
     for width, height in ((8, 8), (512, 340), (768, 576)):
-        scene = load_spectral_scene(path, width=width, height=height)
+        scene = SceneFile(path, size=(width, height)).load()
         pixels = width * height
         for spp in (1, 5, 64, 400):
             samples = passes.split(scene, spp)
@@ -311,7 +310,7 @@ def test_a_sampler_that_rounds_up_draws_the_samples_requested(llvm, tmp_path, mo
     assert calls == [(0, 12), (4, 12), (8, 12), (12, 12)]
     assert image.attributes["spp"] == 12
     assert capfd.readouterr() == ("", "")
-    assert load_spectral_scene(path).sensors()[0].sampler().sample_count() == 16
+    assert SceneFile(path).load().sensors()[0].sampler().sample_count() == 16
 
 
 @pytest.mark.parametrize("kind", ["multijitter", "stratified"])
@@ -328,7 +327,7 @@ def test_all_numbers_of_a_sample_are_uniform_in_pairs(llvm, tmp_path, kind):
             return "Recorder"
 
     path = write_scene(tmp_path, CONSTANT, sensor=SENSOR.replace("independent", kind))
-    scene = load_spectral_scene(path, width=64, height=64)
+    scene = SceneFile(path, size=(64, 64)).load()
     for seed in range(8):
         trace_pass(scene, 8, seed, Recorder(mi.Properties()))
     cells = (np.concatenate(drawn, axis=1) * 4).astype(int)
@@ -347,7 +346,7 @@ def test_colours_of_a_picture_in_passes_are_those_of_independent_samples(llvm, t
     for kind in ("independent", "multijitter"):
         path = tmp_path / f"{kind}.xml"
         path.write_text(scene.replace("independent", kind))
-        means.append(spectrum_to_XYZ(render(path, spp=384, width=128, height=128).radiance.mean((0, 1)), GRID))
+        means.append(spectrum_to_XYZ(render(SceneFile(path, size=(128, 128)), spp=384).radiance.mean((0, 1)), GRID))
     np.testing.assert_allclose(means[1], means[0], rtol=0.01)
 
 
@@ -382,7 +381,7 @@ BORDERED = """<film type="hdrfilm"><integer name="width" value="24"/><integer na
 def test_a_pass_is_that_of_mitsubas_own_film(rfilter, border, variant, tmp_path):
     use(variant)
     film = BORDERED.format(rfilter=rfilter, border=border)
-    scene = load_spectral_scene(write_scene(tmp_path, SPHERE + '<emitter type="constant"/>', film=film))
+    scene = SceneFile(write_scene(tmp_path, SPHERE + '<emitter type="constant"/>', film=film)).load()
     sums = trace_pass(scene, 5, 11)
     own = np.array(mi.render(scene, spp=5, seed=11)) / channel_weights()
     ratio = sums[..., :-1] / sums[..., -1:]
@@ -396,7 +395,7 @@ LENS = """<sensor type="thinlens"><float name="aperture_radius" value="0.3"/><fl
 
 @pytest.mark.slow
 def test_a_lens_and_a_shutter_draw_their_random_numbers(llvm, tmp_path):
-    scene = load_spectral_scene(write_scene(tmp_path, SPHERE + '<emitter type="constant"/>', sensor=LENS))
+    scene = SceneFile(write_scene(tmp_path, SPHERE + '<emitter type="constant"/>', sensor=LENS)).load()
     sums = trace_pass(scene, 5, 11)
     own = np.array(mi.render(scene, spp=5, seed=11)) / channel_weights()
     np.testing.assert_allclose(sums[..., :-1] / sums[..., -1:], own, rtol=0, atol=2e-5 * own.max())
@@ -413,7 +412,7 @@ def threads():
 def test_equal_seeds_give_equal_bits_on_any_number_of_threads(llvm, threads, tmp_path, rfilter):
     # 997 samples of one pixel are split among threads, and 64 pixels lie under one another's filters.
     film = FILM.replace("box", rfilter)
-    scene = load_spectral_scene(write_scene(tmp_path, SPHERE + CONSTANT, film=film))
+    scene = SceneFile(write_scene(tmp_path, SPHERE + CONSTANT, film=film)).load()
     pictures = []
     for count in (1, 2, 2, 5):
         threads(count)
@@ -429,8 +428,8 @@ def test_integrators_that_do_not_trace_ray_by_ray_give_the_same_mean(llvm, tmp_p
     np.testing.assert_allclose(render(path, spp=256).radiance.mean(), expected, rtol=0.1)
 
 
-def film_of(path, **sizes):
-    return load_spectral_scene(path, **sizes).sensors()[0].film()
+def film_of(path, width=None, height=None):
+    return SceneFile(path, size=(width, height)).load().sensors()[0].film()
 
 
 @pytest.mark.quick
@@ -466,9 +465,9 @@ def test_a_sensor_without_a_film_gets_one(llvm, tmp_path):
 @pytest.mark.slow
 def test_unknown_parameters_are_refused(llvm, tmp_path):
     path = write_scene(tmp_path, CONSTANT)
-    assert render(path, spp=1, parameters={"width": "5"}).radiance.shape[1] == 5
+    assert render(SceneFile(path, {"width": "5"}), spp=1).radiance.shape[1] == 5
     with pytest.raises(ValueError, match=r"\$nonsense=1") as caught:
-        render(path, spp=1, parameters={"nonsense": "1"})
+        render(SceneFile(path, {"nonsense": "1"}), spp=1)
     assert "\n" not in str(caught.value)
 
 
@@ -481,7 +480,7 @@ def test_files_are_looked_up_beside_the_scene(llvm, tmp_path, monkeypatch):
     write_scene(folder, f'<shape type="sphere"><bsdf type="diffuse">{texture}</bsdf></shape>{CONSTANT}')
     monkeypatch.chdir(elsewhere)
     before = str(mi.file_resolver())
-    load_spectral_scene("../scenes/scene.xml")
+    SceneFile("../scenes/scene.xml").load()
     assert str(mi.file_resolver()) == before
 
 
@@ -511,12 +510,12 @@ def test_wrong_requests_are_refused(llvm, tmp_path):
     path = write_scene(tmp_path, CONSTANT)
     with pytest.raises(FileNotFoundError, match=r"none\.xml"):
         render(tmp_path / "none.xml", spp=1)
-    for request in ({"spp": 0}, {"spp": 1, "width": 0}, {"spp": 1, "height": -3}, {"spp": 1, "seed": -1}):
+    for size, request in (((None, None), {"spp": 0}), ((0, None), {}), ((None, -3), {}), ((1, 1), {"seed": -1})):
         with pytest.raises(ValueError, match="wanted"):
-            render(path, **request)
-    for request in ({"spp": 10**12}, {"spp": 1, "width": 10**8}):
+            render(SceneFile(path, size=size), **{"spp": 1, **request})
+    for width, spp in ((None, 10**12), (10**8, 1)):
         with pytest.raises(ValueError, match="wanted at most"):
-            render(path, **request)
+            render(SceneFile(path, size=(width, None)), spp=spp)
     with pytest.raises(ValueError, match="no sensor"):
         render(write_scene(tmp_path, CONSTANT, sensor=""), spp=1)
     (tmp_path / "shape.xml").write_text('<shape version="3.0.0" type="sphere"/>')
@@ -532,10 +531,10 @@ def test_a_picture_that_does_not_fit_into_memory_is_refused_before_it_is_traced(
     monkeypatch.setattr(passes, "trace_pass", None)
     monkeypatch.setattr(film, "available_memory", lambda: 5 * 10**8)
     with pytest.raises(ValueError, match=r"3840 × 2160 pixels, which take 935 MB of memory, .* the 500 MB"):
-        render(path, spp=8, width=3840, height=2160)
+        render(SceneFile(path, size=(3840, 2160)), spp=8)
     monkeypatch.setattr(film, "available_memory", lambda: None)
     with pytest.raises(TypeError, match="not callable"):
-        render(path, spp=8, width=3840, height=2160)
+        render(SceneFile(path, size=(3840, 2160)), spp=8)
 
 
 @pytest.mark.skipif(not Path("/proc/meminfo").exists(), reason="Linux alone reports it")

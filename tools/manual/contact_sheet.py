@@ -20,7 +20,7 @@ from PIL import Image, ImageDraw, ImageFont
 from mitsuba_diffraction.files.writing import whole_file
 from mitsuba_diffraction.render import render
 from mitsuba_diffraction.render.denoise import denoised_picture
-from mitsuba_diffraction.render.scene import load_spectral_scene
+from mitsuba_diffraction.render.scene_file import SceneFile
 from mitsuba_diffraction.render.spectral_image import save_preview
 from mitsuba_diffraction.variants import choose_variant
 
@@ -138,8 +138,8 @@ def picture(name: str, folder: Path, spp: int) -> Image.Image:
         text = LIT.format(objects=OBJECTS[panel.kind], lamps=lamps, sky=sky, **content)
     scene, made = folder / f"{name}.xml", folder / f"{name}.png"
     scene.write_text(text, encoding="utf-8")
-    image = render(scene, spp=spp, width=WIDTH, height=HEIGHT)
-    loaded = load_spectral_scene(scene, width=WIDTH, height=HEIGHT)
+    image = render(SceneFile(scene, size=(WIDTH, HEIGHT)), spp=spp)
+    loaded = SceneFile(scene, size=(WIDTH, HEIGHT)).load()
     save_preview(image, made, denoise=lambda xyz: denoised_picture(loaded, xyz))
     return Image.open(made).copy()
 

@@ -18,6 +18,7 @@ from PIL import Image, ImageDraw, ImageFont
 from mitsuba_diffraction.bsdf.theory import errors_shown
 from mitsuba_diffraction.files.outputs import png_text
 from mitsuba_diffraction.render import render
+from mitsuba_diffraction.render.scene_file import SceneFile
 from mitsuba_diffraction.render.spectral_image import save_preview
 from mitsuba_diffraction.variants import choose_variant
 
@@ -34,7 +35,7 @@ def pictures(folder: Path) -> list[Image.Image]:
     chosen, exposure = [{"representation": "taylor", "terms": str(terms)} for terms in (4, 10, 20)], None
     found = []
     for parameters in ({"representation": "slices"}, *chosen):
-        image = render(SCENE, spp=SPP, width=WIDTH, parameters={"skin": "xenopeltis_tile", **parameters})
+        image = render(SceneFile(SCENE, {"skin": "xenopeltis_tile", **parameters}, size=(WIDTH, None)), spp=SPP)
         exposure = save_preview(image, folder / "picture.png", exposure)
         with Image.open(folder / "picture.png") as picture:
             found.append(picture.convert("RGB").crop(CROP))

@@ -21,9 +21,9 @@ from ...files.writing import examples_folder
 from ...optics.color import spectrum_to_linear_sRGB
 from ...progress import Progress, silent
 from ...render.film import pass_seed, trace_pass
-from ...render.parsed_scene import parsed
 from ...render.passes import Accumulation
 from ...render.scene import instantiated
+from ...render.scene_file import SceneFile
 from ...render.scene_film import channel_wavelengths, replace_films
 from ...render.scene_light import draw_wavelengths_of_lights
 from ...settings import VISIBLE
@@ -239,7 +239,7 @@ def load_for_noise(
     path: Path, width: int, partner: dict[str, Any] | None, type: str = "path", **integrator: int
 ) -> mi.Scene:
     """Load a scene with independent samples and another integrator; `partner` replaces its gratings, if given."""
-    with parsed(path, None) as (config, state):
+    with SceneFile(path).parsed() as (config, state):
         replace_films(state, width, None)
         for node in state.nodes:
             if node.type == mi.ObjectType.Integrator:

@@ -56,7 +56,7 @@ def compare(
 
     import mitsuba as mi
 
-    from ...render.parsed_scene import files_of_scene
+    from ...render.scene_file import SceneFile
     from ...variants import choose_variant
     from ..comparison import compare as run
     from ..comparison import figure, summary
@@ -69,10 +69,10 @@ def compare(
     if scene.suffix.lower() == ".toml":
         parameters = {"spectrum": str(scene.resolve()), **parameters}
         scene = examples_folder() / "scenes" / "scan.xml"
-    if "light" not in parameters and (lights := supported_lights(scene, parameters)):
+    if "light" not in parameters and (lights := supported_lights(SceneFile(scene, parameters))):
         parameters["light"] = lights[-1]
         say("note", f"the shader does not know the lights of {scene.name}: light={lights[-1]}, of {', '.join(lights)}")
-    reads = files_of_scene(scene, parameters)
+    reads = SceneFile(scene, parameters).files()
     prefix = output
     if output is None or output.is_dir():
         folder = output or Path()

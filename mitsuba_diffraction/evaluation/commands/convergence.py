@@ -44,7 +44,7 @@ def convergence(
     """
     import mitsuba as mi
 
-    from ...render.parsed_scene import files_of_scene
+    from ...render.scene_file import SceneFile
     from ...variants import choose_variant
     from ..comparison import convergence as study
     from ..comparison import series
@@ -61,7 +61,7 @@ def convergence(
         own = {"representation": "auto", "terms": "auto", "heights_from": ORIGINS[0]}
     check_suffix("-o", plot, ".png")
     written = [("-o", plot), *([("--json", json)] if json is not None else [])]
-    outputs.check_outputs(files_of_scene(scene, {**parameters, **own}), written, overwrite=overwrite)
+    outputs.check_outputs(SceneFile(scene, {**parameters, **own}).files(), written, overwrite=overwrite)
     mi.set_variant(choose_variant(variant))
     if terms is not None:
         origin = parameters.get("heights_from")

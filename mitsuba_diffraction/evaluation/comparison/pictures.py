@@ -20,9 +20,9 @@ from ...optics.color import spectrum_to_XYZ
 from ...progress import Progress, part, silent
 from ...render import SpectralImage
 from ...render.film import check_memory, collect, equal_ranges, pass_seed, rotated_sampler, sampler_of, trace_pass
-from ...render.parsed_scene import parsed
 from ...render.passes import Accumulation, ratio, split
-from ...render.scene import load_spectral_scene, recorded_range
+from ...render.scene import recorded_range
+from ...render.scene_file import SceneFile
 from ...render.scene_film import channel_wavelengths
 from ...settings import VISIBLE
 from ..realtime_shader import tristimulus
@@ -165,7 +165,7 @@ class Pictures:
         brightness: float | None = None,
         pigment: bool = True,
     ) -> None:
-        """Load the scene; see `load_spectral_scene`.
+        """Load the scene; see `SceneFile.load`.
 
         Args:
             scene_path: an XML scene whose integrator is a path tracer.
@@ -188,8 +188,9 @@ class Pictures:
         self._luminance: float | None = None  # of the diffraction in `same_light`, mean over the gratings
         if seed < 0:
             raise RequestError(f"seed: got {seed}, wanted an integer that is not negative")
-        _check_lights(Path(scene_path), parameters)
-        self.scene = load_spectral_scene(scene_path, width=width, height=height, parameters=parameters)
+        scene_file = SceneFile(scene_path, parameters or {}, size=(width, height))
+        _check_lights(scene_file)
+        self.scene = scene_file.load()
         if hasattr(self.scene.integrator(), "quirks"):
             raise RequestError(f"{scene_path}: its integrator is the shader itself, wanted a path tracer (type='path')")
         if (found := recorded_range(self.scene)) != VISIBLE:
@@ -430,12 +431,10 @@ class Pictures:
         return np.concatenate([np.array(position), np.array(rgb)])
 
 
-def supported_lights(
-    scene: str | os.PathLike[str], parameters: Mapping[str, str] | None = None
-) -> tuple[str, ...] | None:
+def supported_lights(scene_file: SceneFile) -> tuple[str, ...] | None:
     """Return the values of a scene's parameter `light` that the shader supports; None if its lights are supported."""
-    scene = Path(scene)
-    with parsed(scene, parameters) as (_, state):
+    scene = Path(scene_file.path)
+    with scene_file.parsed() as (_, state):
         emitters = {node.props.plugin_name() for node in state.nodes if node.type == mi.ObjectType.Emitter}
     if emitters & {"directional", "point"}:
         return None
@@ -451,12 +450,12 @@ def supported_lights(
     )
 
 
-def _check_lights(scene: Path, parameters: Mapping[str, str] | None) -> None:
+def _check_lights(scene_file: SceneFile) -> None:
     """Raise RequestError if the shader supports no light of a scene, before any spectrum is computed."""
-    if (lights := supported_lights(scene, parameters)) is not None:
+    if (lights := supported_lights(scene_file)) is not None:
         advice = f"; choose {' or '.join(f'-D light={name}' for name in lights)}" if lights else ""
         raise RequestError(
-            f"{scene}: the scene has no directional or point light, and the shader knows no other{advice}"
+            f"{scene_file.path}: the scene has no directional or point light, and the shader knows no other{advice}"
         )
 
 

@@ -28,7 +28,7 @@ from ...progress import Progress, no_progress
 from ...render import SpectralImage
 from ...render.film import pass_seed, trace_pass
 from ...render.passes import Accumulation, split
-from ...render.scene import load_spectral_scene
+from ...render.scene_file import SceneFile
 from ...render.scene_film import channel_wavelengths
 from ...settings import ORIGINS, SERIES, ScalarSettings
 from ..realtime_shader.surfaces import gratings_of
@@ -172,7 +172,7 @@ def study(
 def _loaded(path: str | os.PathLike[str], width: int | None, parameters: Mapping[str, str]) -> mi.Scene:
     # The error of a series is in the table.
     with errors_shown():
-        return load_spectral_scene(path, width=width, parameters=parameters)
+        return SceneFile(path, parameters, size=(width, None)).load()
 
 
 def _spectrum(scene: mi.Scene, representation: str) -> GratingSpectrum:
