@@ -113,8 +113,9 @@ def render(
     import mitsuba as mi
 
     from ..render.cluster import trace_on
-    from ..render.passes import checkpoint_path, trace_locally
+    from ..render.passes import trace_locally
     from ..render.scene_file import SceneFile
+    from ..render.sums import checkpoint_path
     from ..render.turntable import animations_of, save_animation
     from ..render.turntable import orbit as motions_of_orbit
     from ..variants import choose_variant
@@ -272,9 +273,10 @@ def _picture(
         complete: number of completed pictures, as text to report if Ctrl-C interrupts this one.
     """
     from ..render.denoise import check_requirements, denoised_picture
-    from ..render.passes import Finished, Interrupted, checkpoint_path, discard_checkpoints
+    from ..render.passes import Finished, Interrupted
     from ..render.passes import render as trace
     from ..render.spectral_image import exposure_of_preview, save_preview, stored_digest, wider_hats
+    from ..render.sums import checkpoint_path, discard_checkpoints
 
     start = time.perf_counter()
     checkpoint, preview = checkpoint_path(path), _preview(path)

@@ -22,8 +22,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..errors import RequestError, pip_install
-from .film import LightOfBands
 from .passes import Job, Tracer, trace_band, versions
+from .trace_pass import LightOfBands
 
 # Held while a pass is traced: it uses all threads of Dr.Jit, and two at a time would only need more memory.
 pass_lock = threading.Lock()

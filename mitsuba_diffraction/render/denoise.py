@@ -20,8 +20,8 @@ from scipy import fft
 
 from ..errors import RequestError, pip_install
 from ..optics.color import SRGB_TO_XYZ
-from .film import Rows
 from .spectral_image import split_rows
+from .trace_pass import Rows
 
 _SAMPLES_OF_GUIDES = 16  # per pixel
 _ALBEDO_WAVELENGTHS = (610.0, 550.0, 465.0)  # nm: red, green, blue

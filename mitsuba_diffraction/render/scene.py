@@ -13,8 +13,8 @@ import numpy as np
 from ..bsdf.base import gratings_in
 from ..bsdf.light import cover_light, recorded_wavelengths
 from .parser_state import children_of
-from .scene_film import SpectralRange
 from .scene_light import warn_of_light_from_below
+from .spectral_film import SpectralRange
 
 _log = logging.getLogger(__name__)
 

@@ -28,9 +28,9 @@ from ..progress import progress_bar
 from ..variants import is_supported
 from .parser_state import children_of, resolved_file
 from .scene import instantiated, move_first_sensor, trace_cast_light, unwrap_integrators
-from .scene_film import replace_films
 from .scene_light import draw_wavelengths_of_lights
 from .scene_materials import Materials, check_materials, replace_materials, warn_of_unused_materials
+from .spectral_film import replace_films
 
 _PLUGINS = ("diffraction_grating", "diffraction_path", "diffraction_shader")
 _FORMATS_WITH_ALPHA = {"luminance_alpha", "rgba", "xyza"}

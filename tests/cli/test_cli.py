@@ -392,7 +392,7 @@ def test_a_bug_inside_a_plugin_is_not_blamed_on_the_scene(command, monkeypatch):
 
 def test_a_bug_while_rendering_is_reported_as_such(command, monkeypatch):
     Path("scene.xml").write_text(SCENE)
-    monkeypatch.setattr("mitsuba_diffraction.render.film.needs_mitsubas_film", broadcast)
+    monkeypatch.setattr("mitsuba_diffraction.render.trace_pass.needs_mitsubas_film", broadcast)
     code, out, err = command("render scene.xml --spp 1 -o out.exr")
     assert (code, out) == (1, "")
     assert err.startswith(f"{BUG}ValueError: ")

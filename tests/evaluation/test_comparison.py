@@ -20,7 +20,7 @@ from mitsuba_diffraction.evaluation.realtime_shader.evaluate import VARIANTS
 from mitsuba_diffraction.evaluation.realtime_shader.quirks import Quirks
 from mitsuba_diffraction.optics.color import delta_E, spectrum_to_XYZ
 from mitsuba_diffraction.render.scene_file import SceneFile
-from mitsuba_diffraction.render.scene_film import channel_wavelengths, channel_weights
+from mitsuba_diffraction.render.spectral_film import channel_wavelengths, channel_weights
 
 # A sphere above a plate, with a pigment; broad lobes, so that small pictures resolve them.
 GRATING = """<bsdf type="diffraction_grating"><string name="profile" value="{profile}"/>

@@ -12,7 +12,7 @@ from bsdf_support import bitmap, grating, uniform
 import mitsuba_diffraction  # noqa: F401 (settles which LLVM is used before a variant is set)
 from mitsuba_diffraction.evaluation.benchmark.noise import load_for_noise
 from mitsuba_diffraction.integrator.unshadowed_light import UnshadowedLight
-from mitsuba_diffraction.render.film import trace_pass
+from mitsuba_diffraction.render.trace_pass import trace_pass
 
 SCENES = Path(__file__).parents[2] / "scenes"
 WAVELENGTHS = (430.0, 500.0, 570.0, 640.0)

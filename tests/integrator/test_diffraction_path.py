@@ -11,9 +11,9 @@ from bsdf_support import bitmap, grating, uniform, use
 
 import mitsuba_diffraction  # noqa: F401 (settles which LLVM is used before a variant is set)
 from mitsuba_diffraction.render import scene as scene_module
-from mitsuba_diffraction.render.film import trace_pass
 from mitsuba_diffraction.render.scene_file import SceneFile
-from mitsuba_diffraction.render.scene_film import channel_weights
+from mitsuba_diffraction.render.spectral_film import channel_weights
+from mitsuba_diffraction.render.trace_pass import trace_pass
 
 SUN = {"type": "directional", "direction": [0, 0.6, -0.8], "irradiance": uniform(1.0)}
 SKY = {"type": "constant", "radiance": uniform(0.05)}

@@ -16,12 +16,14 @@ from PIL import Image
 
 import mitsuba_diffraction  # noqa: F401 (settles which LLVM is used before a variant is set)
 from mitsuba_diffraction.optics.color import spectrum_to_XYZ
-from mitsuba_diffraction.render import SpectralImage, film, passes, render
-from mitsuba_diffraction.render.film import LightOfBands, bands_of, trace_pass
-from mitsuba_diffraction.render.passes import BandedImage, Interrupted, trace_locally
+from mitsuba_diffraction.render import SpectralImage, passes, render
+from mitsuba_diffraction.render import trace_pass as tracing
+from mitsuba_diffraction.render.passes import Interrupted, trace_locally
 from mitsuba_diffraction.render.scene_file import SceneFile
-from mitsuba_diffraction.render.scene_film import channel_wavelengths
+from mitsuba_diffraction.render.spectral_film import channel_wavelengths
 from mitsuba_diffraction.render.spectral_image import save_preview
+from mitsuba_diffraction.render.sums import Accumulation, BandedImage, discard_checkpoints
+from mitsuba_diffraction.render.trace_pass import LightOfBands, bands_of, trace_pass
 
 # A grating in the sun in front of a wall, and of a crop window of 12 × 10 pixels.
 SCENE = """<scene version="3.0.0">
@@ -77,14 +79,14 @@ SCENE_WITH_ALPHA = """<scene version="3.0.0">
 
 @pytest.fixture
 def three_bands(monkeypatch):
-    monkeypatch.setattr(film, "BAND_PIXELS", 40)
+    monkeypatch.setattr(tracing, "BAND_PIXELS", 40)
 
 
 def test_bands_cover_the_film(monkeypatch):
     built = SceneFile(write_scene()).load()
     assert bands_of(built) == ((0, 10),)
     for pixels, count in ((119, 2), (40, 3), (12, 10), (1, 10)):
-        monkeypatch.setattr(film, "BAND_PIXELS", pixels)
+        monkeypatch.setattr(tracing, "BAND_PIXELS", pixels)
         bands = bands_of(built)
         assert len(bands) == count
         assert [row for first, end in bands for row in range(first, end)] == list(range(10))
@@ -205,7 +207,7 @@ def test_bands_are_interrupted_resumed_and_saved(integrator, three_bands, small_
     resumed.save("c.1")
     with pytest.raises(ValueError, match=r"c\.1: not a checkpoint"):
         render("scene.xml", **request)
-    passes.discard_checkpoints("c")
+    discard_checkpoints("c")
     assert {path.name for path in Path().iterdir()} == {"scene.xml", "a.exr"}
 
 
@@ -214,7 +216,7 @@ def test_previews_of_bands_hold_one_band_in_memory(three_bands, small_passes, mo
     monkeypatch.setattr(passes, "MIN_CHECKPOINT_INTERVAL", 0)
     whole = render(write_scene(), spp=2)
     rows, previews = [], []
-    radiance = passes.Accumulation.radiance
+    radiance = Accumulation.radiance
 
     def of_rows(sums, *blocks):
         rows.append(len(sums.luminance))
@@ -226,7 +228,7 @@ def test_previews_of_bands_hold_one_band_in_memory(three_bands, small_passes, mo
         previews.append(np.array(Image.open("a.png")))
 
     with monkeypatch.context() as patch:
-        patch.setattr(passes.Accumulation, "radiance", of_rows)
+        patch.setattr(Accumulation, "radiance", of_rows)
         resumed = render("scene.xml", spp=2, checkpoint="c", seconds=0, on_checkpoint=look)
     np.testing.assert_array_equal(resumed.radiance, whole.radiance)
     assert len(previews) == 5  # after all bands but the last
@@ -239,7 +241,7 @@ def test_previews_of_bands_hold_one_band_in_memory(three_bands, small_passes, mo
 def test_the_error_of_bands_is_that_of_the_whole_picture(three_bands, small_passes, monkeypatch):
     small_passes(11)
     banded = render(write_scene(), spp=64, until_error=0.2)
-    monkeypatch.setattr(film, "BAND_PIXELS", 1000)
+    monkeypatch.setattr(tracing, "BAND_PIXELS", 1000)
     whole = render("scene.xml", spp=64, until_error=0.2)
     assert banded.attributes["error"] <= 0.2
     assert banded.attributes["spp"] < 64

@@ -11,7 +11,7 @@ from bsdf_support import use
 from test_render import CONSTANT, SENSOR, SPHERE, write_scene
 
 from mitsuba_diffraction.errors import RequestError
-from mitsuba_diffraction.render import cluster, denoise, film, passes, render
+from mitsuba_diffraction.render import cluster, denoise, passes, render, trace_pass
 from mitsuba_diffraction.render.passes import split
 from mitsuba_diffraction.render.scene_file import SceneFile
 from mitsuba_diffraction.render.spectral_image import SpectralImage
@@ -61,7 +61,7 @@ def test_requests_that_cannot_be_met(llvm, tmp_path, monkeypatch):
     one_line("in the place of a BSDF that transmits light", lambda: SceneFile(path, materials=grating).load())
     one_line("spp: got 0, wanted a positive number", lambda: render(path, spp=0))
     one_line("wanted at most .* for so large a picture", lambda: split(SceneFile(path).load(), 10**14))
-    monkeypatch.setattr(film, "available_memory", lambda: 1000)
+    monkeypatch.setattr(trace_pass, "available_memory", lambda: 1000)
     one_line("film: got 8 × 8 pixels, which take .* that are available", lambda: render(path, spp=1))
     monkeypatch.setitem(sys.modules, "pyoidn", None)
     one_line("--denoise: pyoidn is not installed", denoise.check_requirements)

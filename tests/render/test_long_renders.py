@@ -19,16 +19,12 @@ import mitsuba_diffraction  # noqa: F401 (settles which LLVM is used before a va
 from mitsuba_diffraction.files.writing import exclusive
 from mitsuba_diffraction.optics.color import spectrum_to_XYZ
 from mitsuba_diffraction.render import SpectralImage, passes, render
-from mitsuba_diffraction.render.passes import (
-    Accumulation,
-    Interrupted,
-    error_of_picture,
-    load_checkpoint,
-    save_checkpoint,
-)
+from mitsuba_diffraction.render import sums as sums_of_passes
+from mitsuba_diffraction.render.passes import Interrupted
 from mitsuba_diffraction.render.scene_file import SceneFile
-from mitsuba_diffraction.render.scene_film import channel_wavelengths
+from mitsuba_diffraction.render.spectral_film import channel_wavelengths
 from mitsuba_diffraction.render.spectral_image import save_preview, stored_digest
+from mitsuba_diffraction.render.sums import Accumulation, error_of_picture, load_checkpoint, save_checkpoint
 from mitsuba_diffraction.render.turntable import orbit
 
 SIZE = 16
@@ -203,7 +199,9 @@ def test_checkpoints_are_written_every_so_often(monkeypatch):
     clock = iter(np.arange(0, 1000, 4.0))  # each look at the clock is four seconds after the one before
     monkeypatch.setattr(passes.time, "monotonic", lambda: next(clock))
     written = []
-    monkeypatch.setattr(passes, "save_checkpoint", lambda checkpoint, digest, sums: written.append(sums.samples))
+    monkeypatch.setattr(
+        sums_of_passes, "save_checkpoint", lambda checkpoint, digest, sums: written.append(sums.samples)
+    )
     render("scene.xml", spp=60, checkpoint="c", seconds=10)
     # After three looks; then twenty times the four seconds that one took to write, counted from its beginning.
     assert written == [3, 22, 41]

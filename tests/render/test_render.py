@@ -15,13 +15,14 @@ import mitsuba_diffraction  # noqa: F401 (settles which LLVM is used before a va
 from mitsuba_diffraction.bsdf.device_tables import PacketTable
 from mitsuba_diffraction.errors import Bug, RequestError
 from mitsuba_diffraction.optics.color import spectrum_to_linear_sRGB, spectrum_to_XYZ
-from mitsuba_diffraction.render import film, passes, render
+from mitsuba_diffraction.render import passes, render
+from mitsuba_diffraction.render import trace_pass as tracing
 from mitsuba_diffraction.render.denoise import guides
-from mitsuba_diffraction.render.film import trace_pass
 from mitsuba_diffraction.render.scene_file import SceneFile
-from mitsuba_diffraction.render.scene_film import channel_wavelengths, channel_weights
 from mitsuba_diffraction.render.scene_light import max_plausible_luminance
+from mitsuba_diffraction.render.spectral_film import channel_wavelengths, channel_weights
 from mitsuba_diffraction.render.spectral_image import save_preview
+from mitsuba_diffraction.render.trace_pass import trace_pass
 
 GRID = channel_wavelengths()
 SCENES = Path(__file__).parents[2] / "scenes"
@@ -529,10 +530,10 @@ def test_wrong_requests_are_refused(llvm, tmp_path):
 def test_a_picture_that_does_not_fit_into_memory_is_refused_before_it_is_traced(llvm, tmp_path, monkeypatch):
     path = write_scene(tmp_path, CONSTANT)
     monkeypatch.setattr(passes, "trace_pass", None)
-    monkeypatch.setattr(film, "available_memory", lambda: 5 * 10**8)
+    monkeypatch.setattr(tracing, "available_memory", lambda: 5 * 10**8)
     with pytest.raises(ValueError, match=r"3840 × 2160 pixels, which take 935 MB of memory, .* the 500 MB"):
         render(SceneFile(path, size=(3840, 2160)), spp=8)
-    monkeypatch.setattr(film, "available_memory", lambda: None)
+    monkeypatch.setattr(tracing, "available_memory", lambda: None)
     with pytest.raises(TypeError, match="not callable"):
         render(SceneFile(path, size=(3840, 2160)), spp=8)
 
@@ -540,7 +541,7 @@ def test_a_picture_that_does_not_fit_into_memory_is_refused_before_it_is_traced(
 @pytest.mark.skipif(not Path("/proc/meminfo").exists(), reason="Linux alone reports it")
 def test_the_available_memory_is_that_of_the_system():
     pages = os.sysconf("SC_AVPHYS_PAGES") * os.sysconf("SC_PAGE_SIZE")
-    assert 0.5 * pages < film.available_memory()
+    assert 0.5 * pages < tracing.available_memory()
 
 
 DIRECTIONAL = '<emitter type="directional"><vector name="direction" x="0" y="0" z="-1"/></emitter>'

@@ -20,12 +20,12 @@ from numpy.typing import NDArray
 from ...files.writing import examples_folder
 from ...optics.color import spectrum_to_linear_sRGB
 from ...progress import Progress, silent
-from ...render.film import pass_seed, trace_pass
-from ...render.passes import Accumulation
 from ...render.scene import instantiated
 from ...render.scene_file import SceneFile
-from ...render.scene_film import channel_wavelengths, replace_films
 from ...render.scene_light import draw_wavelengths_of_lights
+from ...render.spectral_film import channel_wavelengths, replace_films
+from ...render.sums import Accumulation
+from ...render.trace_pass import pass_seed, trace_pass
 from ...settings import VISIBLE
 from ..comparison.series import shows_gratings
 from .measured import write_measured

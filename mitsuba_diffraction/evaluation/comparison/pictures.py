@@ -19,11 +19,12 @@ from ...errors import RequestError
 from ...optics.color import spectrum_to_XYZ
 from ...progress import Progress, part, silent
 from ...render import SpectralImage
-from ...render.film import check_memory, collect, equal_ranges, pass_seed, rotated_sampler, sampler_of, trace_pass
-from ...render.passes import Accumulation, ratio, split
+from ...render.passes import split
 from ...render.scene import recorded_range
 from ...render.scene_file import SceneFile
-from ...render.scene_film import channel_wavelengths
+from ...render.spectral_film import channel_wavelengths
+from ...render.sums import Accumulation, ratio
+from ...render.trace_pass import check_memory, collect, equal_ranges, pass_seed, rotated_sampler, sampler_of, trace_pass
 from ...settings import VISIBLE
 from ..realtime_shader import tristimulus
 from ..realtime_shader.diffraction_shader import PUBLISHED_BRIGHTNESS, checked_brightness, parameters_of_variant

@@ -26,10 +26,11 @@ from ...optics.color import XYZ_to_linear_sRGB, delta_E, into_gamut, on_screen, 
 from ...precomputation.grating_spectrum import GratingSpectrum
 from ...progress import Progress, no_progress
 from ...render import SpectralImage
-from ...render.film import pass_seed, trace_pass
-from ...render.passes import Accumulation, split
+from ...render.passes import split
 from ...render.scene_file import SceneFile
-from ...render.scene_film import channel_wavelengths
+from ...render.spectral_film import channel_wavelengths
+from ...render.sums import Accumulation
+from ...render.trace_pass import pass_seed, trace_pass
 from ...settings import ORIGINS, SERIES, ScalarSettings
 from ..realtime_shader.surfaces import gratings_of
 from .difference import as_shown, white_luminance

@@ -18,7 +18,7 @@ from .parser_state import add_child, children_of
 # resolved. The spacing affects memory but not time, as `film` adds a sample to at most eight channels.
 _CHANNEL_STEP = 5.0
 _STEPS_PER_CHANNEL = 20  # of the density from which wavelengths are drawn; a step is narrower than a lamp's lines
-_MAX_PIXELS = 2**25  # above 7680 × 4320; see also `film.check_memory`
+_MAX_PIXELS = 2**25  # above 7680 × 4320; see also `trace_pass.check_memory`
 _DEFAULT_SIZE = (768, 576)  # width and height of Mitsuba's films
 
 

@@ -28,7 +28,7 @@ from ..errors import RequestError, root_cause
 from ..integrator.paths import LightPaths, random_numbers, unpacked
 from ..progress import bytes_text
 from .scene import no_warnings, recorded_range
-from .scene_film import channel_wavelengths, channel_weights
+from .spectral_film import channel_wavelengths, channel_weights
 
 Rows = tuple[int, int]
 """The first row of a band of a picture, and the row after its last."""
