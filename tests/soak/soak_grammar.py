@@ -110,6 +110,7 @@ class Configuration:
         directions: (θ, φ, texel): degrees from the normal and from x, and which texel is hit.
         wavelengths: those of a ray, nm.
         render: whether pixels are rendered, which takes longer than all the rest.
+        derived: which parameter is derived through a rendering, by which integrator and in which wrapper; or None.
     """
 
     surface: Surface = Surface()
@@ -131,6 +132,7 @@ class Configuration:
     theory: str = "scalar"
     polarised: bool = False
     render: bool = False
+    derived: int | None = None
     directions: tuple = ((45.0, 0.0, 0),)
     wavelengths: tuple = (450.0, 500.0, 550.0, 620.0)
 
@@ -489,6 +491,7 @@ def configurations(draw):
         conserve_energy=energy,
         polarised=draw(st.sampled_from([False] * 7 + [True])),
         render=draw(st.sampled_from([False] * 11 + [True])),
+        derived=draw(st.one_of(*[st.none()] * 19, st.integers(0, 999))),
         directions=draw(directions(transmission)),
         wavelengths=draw(wavelengths()),
     )

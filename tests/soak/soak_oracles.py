@@ -745,6 +745,78 @@ def luminance_of_one():
     return np.array(mi.render(scene, integrator=mi.load_dict({"type": "path"}), spp=4096)).mean()
 
 
+# (j) -----------------------------------------------------------------------------------------------------------------
+WRAPPERS = (
+    lambda bsdf: bsdf,
+    lambda bsdf: {"type": "blendbsdf", "weight": 0.7, "a": {"type": "diffuse"}, "b": bsdf},
+    lambda bsdf: {"type": "mask", "opacity": 0.8, "bsdf": bsdf},
+)
+STEPS = {"orientation": 0.02, "lateral_scale": 2e-4, "thin_film_thickness": 5e-4}  # of others 5e-3
+
+
+def derivatives_are_differences(case: Case):
+    """(j) dr.backward through mi.render, by any parameter of mi.traverse, is the difference of two pictures.
+
+    They have the samples of the derivative, and light of the sun, so that no direction that is drawn matters. E is left
+    out, as other scales have other tables of it.
+    """
+    c = case.c
+    (wi, texel), wavelength = case.directions[0], case.wavelengths[0]
+    if c.derived is None or c.polarised or abs(wi[2]) < 0.1:
+        return
+    _, wo = case.model.orders(wi, wavelength * 1e-3, bool(wi[2] < 0), c.at(texel))
+    wo = wo[np.abs(wo[:, 2]) > 0.1]
+    if not len(wo):
+        return
+    # On the slope of the lobe of an order.
+    sun = wo[c.derived % len(wo)] + 0.7 * wavelength * 1e-3 * case.model.sigma_q * np.array([0.6, 0.8, 0])
+    film = {"type": "specfilm", "width": 4, "height": 4, "rfilter": {"type": "box"}, "component_format": "float32"}
+    low, high = max(wavelength - 30, VISIBLE[0]), min(wavelength + 30, VISIBLE[1])
+    film["band"] = {"type": "regular", "wavelength_min": low, "wavelength_max": high, "values": "1, 1"}
+    to_world = mi.ScalarTransform4f().look_at([float(v) for v in 3 * wi], [0, 0, 0], [0.1, 1, 0.2])
+    bsdf = WRAPPERS[c.derived % len(WRAPPERS)](c.dictionary(conserve_energy=False if c.theory == "scalar" else None))
+    kind = ("path", "prb", "diffraction_path")[c.derived // 3 % 3]
+    scene = mi.load_dict(
+        {
+            **{"type": "scene", "integrator": {"type": kind, "max_depth": 3}},
+            "sensor": {"type": "orthographic", "to_world": to_world @ mi.ScalarTransform4f().scale(0.3), "film": film},
+            "plate": {"type": "rectangle", "bsdf": bsdf},
+            "sun": {"type": "directional", "direction": [float(-v) for v in sun], "irradiance": 1.0},
+            # Without it `path` has no light where a mask is crossed (Mitsuba 3.9.1, any BSDF below the mask).
+            "sky": {"type": "constant", "radiance": {"type": "uniform", "value": 1e-9}},
+        }
+    )
+    parameters = mi.traverse(scene)
+    fixed = ("to_uv", "to_world", "weight", "opacity", "a.reflectance")
+    keys = [key for key in parameters.keys() if ".bsdf." in key and not any(part in key for part in fixed)]  # noqa: SIM118
+    key = keys[c.derived % len(keys)]
+    name = next((part for part in key.split(".") if part in STEPS), "")
+    step, start, like = STEPS.get(name, 5e-3), np.array(parameters[key], np.float32), type(parameters[key])
+    samples = dict(spp=256)
+
+    def total(change):
+        parameters[key] = like(start + np.float32(change))
+        parameters.update()
+        return np.array(mi.render(scene, seed=1, **samples), float).sum()
+
+    x = like(start)
+    dr.enable_grad(x)
+    parameters[key] = x
+    parameters.update()
+    dr.backward(dr.sum(mi.render(scene, parameters, seed=0, seed_grad=1, **samples), axis=None))
+    found = np.array(dr.grad(x), float).sum()
+    # Where the tables of two intervals of κ meet, differences of two steps differ.
+    wanted, twice = ((total(-s) - total(s)) / (-2 * s) for s in (step, 2 * step))
+    error = 3 * abs(wanted - twice) + 0.03 * abs(wanted) + 1e-3 * total(0.0) / max(np.abs(start).max(initial=0), 0.1)
+    case.require(
+        np.isfinite(found) and abs(found - wanted) <= error,
+        f"(j) derivative by {key.partition('.bsdf.')[2]} through {kind} = difference",
+        found=found,
+        wanted=wanted,
+        twice=twice,
+    )
+
+
 ORACLES = {
     "value": value_is_that_of_the_model,
     "density": samples_have_their_density_and_average_to_the_integral,
@@ -754,6 +826,7 @@ ORACLES = {
     "neutral": neutral_parameters_change_nothing,
     "tables": tables_hold_where_they_end,
     "integrators": integrators_agree,
+    "derivatives": derivatives_are_differences,
 }
 
 

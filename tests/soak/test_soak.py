@@ -15,6 +15,7 @@ import hypothesis
 import pytest
 from hypothesis import HealthCheck, Phase, given, settings
 from soak_grammar import Configuration, Surface, configurations
+from soak_model import Cauchy
 from soak_oracles import judge
 
 pytestmark = [
@@ -67,6 +68,12 @@ CASES = {
         directions=((110.71, 0.0, 3),),
         wavelengths=(830.0, 714.1, 449.9, 635.8),
     ),
+    # The index of the coat was that of 547 nm.
+    "medium under a coat of which both disperse": Configuration(
+        SINUSOID, material=Cauchy(1.532, 0.0059), coat=Cauchy(1.54, 0.012), wavelengths=(380.0, 450.0, 550.0, 700.0)
+    ),
+    # The process ended.
+    "derivative by lengths": Configuration(SINUSOID, lateral_scale=0.9, derived=5, directions=((20.0, 0.0, 0),)),
     # Rows of bins without power were drawn, and had no density.
     "no frequency propagates": Configuration(
         Surface("ridges", (1.111, 1.111), 0.534, shape=0.5, seed=91),
@@ -83,7 +90,7 @@ CASES = {
 @pytest.mark.few(3)
 @pytest.mark.parametrize("name", CASES)
 def test_case(llvm, tmp_path, name):
-    judge(CASES[name], tmp_path, ("value", "density", "tables"))
+    judge(CASES[name], tmp_path, ("value", "density", "tables", "derivatives"))
 
 
 @pytest.mark.parametrize("fixed", [1, pytest.param(4, marks=pytest.mark.slow)])
