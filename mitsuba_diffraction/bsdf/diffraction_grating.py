@@ -13,7 +13,7 @@ from ..optics.materials import DISPERSION
 from ..plugin_parameters import Parameter, listed
 from ..precomputation.recipe import MAX_PATCHES, Recipe, parameters_of_profile
 from ..surface.gratings import PROFILES, RENAMED
-from .base import base_from, living
+from .base import living
 from .layers import Layers
 from .parameters import GratingRequest
 from .thin_film import MAX_THICKNESS
@@ -207,7 +207,6 @@ def check(props: mi.Properties) -> None:
         FileNotFoundError: if there is no such file.
     """
     refuse_wrong(props)
-    base_from(props)
     surface = GratingRequest.of(props).surface
     if isinstance(surface, Recipe):
         surface.check()
@@ -223,7 +222,7 @@ def define() -> type:
             # The initialiser of the base class registers the object, which Dr.Jit then calls in all scenes as long as
             # it exists, even if only a traceback refers to it: therefore errors must occur before.
             refuse_wrong(props)
-            self.layers = Layers(props)
+            self.layers = Layers(GratingRequest.of(props))
             self.spectrum = self.layers.grating.spectrum
             mi.BSDF.__init__(self, props)
             living.add(self)

@@ -39,16 +39,15 @@ class Grating:
         scales, orientation, from_radius: see `GratingRequest`.
     """
 
-    def __init__(self, props: mi.Properties, request: GratingRequest) -> None:
+    def __init__(self, request: GratingRequest) -> None:
         self.coat, self.scales = request.media.coat, request.scales
         self.orientation, self.from_radius = request.orientation, request.from_radius
         surface = request.surface
         self.recipe = surface if isinstance(surface, Recipe) else None
         self.spectrum = surface.cached(_per_cent) if isinstance(surface, Recipe) else surface
-        self.theory = theory_of(props, self.spectrum, request)
+        self.theory = theory_of(self.spectrum, request)
         self._check_window(self.theory.wavelengths[0])
-        # Mitsuba's own object does not outlive the construction of the plugin.
-        self._props, self._request = mi.Properties(props), request
+        self._request = request
         # The grating is black at angles that the spectrum does not cover.
         self.min_cosine = opaque(np.cos(np.deg2rad(self.theory.largest_angle)) * (1 - 1e-6))
 
@@ -85,7 +84,7 @@ class Grating:
             if recipe is None:
                 raise
             self.recipe, self.spectrum = recipe, recipe.cached(_per_cent)
-            self.theory = theory_of(self._props, self.spectrum, self._request)
+            self.theory = theory_of(self.spectrum, self._request)
             # The user may have changed the parameters since the request.
             self.theory.parameters_changed([])
             self.theory.cover(wavelengths)

@@ -7,7 +7,6 @@ from dataclasses import dataclass
 import drjit as dr
 import mitsuba as mi
 
-from .base import base_from
 from .device_tables import BELOW_ONE, smaller
 from .directions import Interface, rotated
 from .grating import Grating
@@ -49,11 +48,9 @@ class Layers:
             components of the base; the front face of a coat or the flat face of a sheet.
     """
 
-    def __init__(self, props: mi.Properties) -> None:
-        request = GratingRequest.of(props)
-        self.coat = request.media.coat
-        self.base = base_from(props)
-        self.grating = Grating(props, request)
+    def __init__(self, request: GratingRequest) -> None:
+        self.coat, self.base = request.media.coat, request.base
+        self.grating = Grating(request)
         flags = mi.BSDFFlags.GlossyReflection | mi.BSDFFlags.Anisotropic | mi.BSDFFlags.FrontSide
         varying = [*self.grating.scales, self.grating.theory.material]
         varies = self.grating.orientation.is_spatially_varying() or any(part.varies for part in varying)

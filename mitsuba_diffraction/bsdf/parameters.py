@@ -28,7 +28,7 @@ from ..settings import (
     wavelengths_inside,
 )
 from ..surface.gratings import PROFILES
-from .base import nested_plugin
+from .base import Base, base_from, nested_plugin
 from .coat import SAME_INDEX, Coat, coat_from
 from .device_tables import larger
 from .fresnel import Conductor, Material, PerfectMirror, SpectralConductor, reflectance_from
@@ -209,11 +209,12 @@ class Scales:
             )
 
 
-def surface_from(props: mi.Properties, media: Media, scale: float = 1.0) -> Spectrum | Recipe:
+def surface_from(props: mi.Properties, media: Media, bare: Material, scale: float = 1.0) -> Spectrum | Recipe:
     """Return the spectrum given by `filename` or `spectrum`, or the recipe given by `filename` or `profile`.
 
-    The recipe is for the wavelengths λ/n in a coat or a dielectric, divided by the maximum `scale`. Its spectrum is not
-    computed here, so that all other parameters can be checked before.
+    The recipe is for the wavelengths λ/n in a coat or a dielectric, divided by the maximum `scale`, and, if it is
+    rigorous, for the material `bare`. Its spectrum is not computed here, so that all other parameters can be checked
+    before.
 
     Raises:
         RequestError: unless exactly one of them is given and valid.
@@ -236,12 +237,16 @@ def surface_from(props: mi.Properties, media: Media, scale: float = 1.0) -> Spec
             raise RequestError(
                 f"spectrum: got {props['spectrum']!r}, wanted a spectrum in Python's load_dict; XML takes a filename"
             )
-        found = surface.settings.theory if isinstance(surface, Recipe) else surface.theory
+        found = _theory_of(surface)
         if props.get("theory", found) != found:
             raise RequestError(f"theory: got {theory!r} with a spectrum of {found} theory, wanted one built for it")
         return surface
-    settings = {"theory": theory, **settings_from(props, media.coat)} if theory == "rigorous" else {}
-    return _inside(props, media, scale, Recipe.of_profile(props["profile"], props, **_requested(props), **settings))
+    settings = {"theory": theory, **_material_settings(props, bare, media.coat)} if theory == "rigorous" else {}
+    return _inside(media, scale, Recipe.of_profile(props["profile"], props, **_requested(props), **settings))
+
+
+def _theory_of(surface: Spectrum | Recipe) -> str:
+    return surface.settings.theory if isinstance(surface, Recipe) else surface.theory
 
 
 def _requested(props: mi.Properties) -> dict[str, Any]:
@@ -258,17 +263,16 @@ def _refuse_requested(props: mi.Properties, of: str) -> None:
         raise RequestError(f"{name}: got {value} with {of}, wanted it when the spectrum is computed")
 
 
-def _inside(props: mi.Properties, media: Media, scale: float, recipe: Recipe) -> Recipe:
+def _inside(media: Media, scale: float, recipe: Recipe) -> Recipe:
     """Return the recipe with the wavelengths next to the relief, divided by `scale`, and, if rigorous, the media.
 
     Parameters that do not match the recipe are refused here, before a table is computed.
     """
     settings, overrides = recipe.settings, dict[str, Any]()
     if isinstance(settings, RigorousSettings):
-        refuse_scalar_only(props)
         if settings.transmission != "none":
-            check_transmission(settings.transmission, media)
-        overrides = settings_of_medium(media)
+            _check_transmission(settings.transmission, media)
+        overrides = _media_settings(media)
     if settings.wavelengths == VISIBLE:
         overrides["wavelengths"] = _next_to_relief(settings.theory, media, scale, VISIBLE)
     return replace(recipe, settings=replace(settings, **overrides))
@@ -294,7 +298,7 @@ def _from_file(props: mi.Properties, media: Media, scale: float) -> Spectrum | R
     if not path.suffix:
         path = Path(source_named(str(path)))
         if str(path) in PROFILES:
-            return _inside(props, media, scale, Recipe.of_profile(str(path), given))
+            return _inside(media, scale, Recipe.of_profile(str(path), given))
     suffix = path.suffix.lower()
     if suffix in (".toml", ".exr") and not path.is_file():
         # An unresolved path is relative; the resolver begins with the folder of the scene.
@@ -302,7 +306,7 @@ def _from_file(props: mi.Properties, media: Media, scale: float) -> Spectrum | R
         available = sorted(other.name for other in folder.glob("*") if other.suffix.lower() in (".exr", ".toml"))
         raise FileNotFoundError(f"{path}: no such file; {folder} holds {', '.join(available) or 'no spectrum'}")
     if suffix == ".toml":
-        return _inside(props, media, scale, Recipe.load(path, **given))
+        return _inside(media, scale, Recipe.load(path, **given))
     if suffix == ".exr":
         _refuse_requested(props, str(path))
         return load_spectrum(path)
@@ -312,23 +316,22 @@ def _from_file(props: mi.Properties, media: Media, scale: float) -> Spectrum | R
     )
 
 
-def settings_from(props: mi.Properties, coat: Coat | None) -> dict[str, Any]:
+def _material_settings(props: mi.Properties, bare: Material, coat: Coat | None) -> dict[str, Any]:
     """Return `material` or `int_ior` for `precompute`, the index relative to the outside.
 
     Raises:
         RequestError: if they are unknown, or the material is the perfect mirror.
     """
-    found = reflectance_from(props, coat)
-    if isinstance(found, Conductor):
+    if isinstance(bare, Conductor):
         return {"material": _resolved(props["material"])}
-    if isinstance(found, SpectralConductor):
+    if isinstance(bare, SpectralConductor):
         raise RequestError("eta: got spectra with theory=rigorous, wanted the name of a conductor or a file: material")
-    if found.dispersion is not None:
+    if bare.dispersion is not None:
         return {"material": _resolved(props["int_ior"])}
-    if isinstance(found, PerfectMirror):
+    if isinstance(bare, PerfectMirror):
         raise RequestError("material: got 'none', wanted a real one for theory=rigorous, such as 'Al'")
     # Rounded to the digits of a float32.
-    eta = float(np.max(found.eta)) * (1 if coat is None else coat.relative)
+    eta = float(np.max(bare.eta)) * (1 if coat is None else coat.relative)
     return {"int_ior": float(f"{eta:.6g}")}
 
 
@@ -337,7 +340,7 @@ def _resolved(index: str) -> str:
     return str(Path(str(mi.file_resolver().resolve(index))).absolute()) if is_file(index) else index
 
 
-def settings_of_medium(media: Media) -> dict[str, Any]:
+def _media_settings(media: Media) -> dict[str, Any]:
     """Return the settings for `precompute` that follow from the coat, the transmission and the variant."""
     medium: dict[str, Any] = {} if media.coat is None else {"ext_ior": float(f"{media.coat.relative:.6g}")}
     if media.transmission != "none":
@@ -345,7 +348,7 @@ def settings_of_medium(media: Media) -> dict[str, Any]:
     return {**medium, "polarised": True} if mi.is_polarized else medium
 
 
-def check_transmission(of_spectrum: str, media: Media) -> None:
+def _check_transmission(of_spectrum: str, media: Media) -> None:
     """Check `transmission` of a rigorous spectrum.
 
     Raises:
@@ -358,7 +361,7 @@ def check_transmission(of_spectrum: str, media: Media) -> None:
         )
 
 
-def refuse_scalar_only(props: mi.Properties) -> None:
+def _refuse_scalar_only(props: mi.Properties) -> None:
     """Check that no parameter of scalar theory alone is given.
 
     Raises:
@@ -371,40 +374,42 @@ def refuse_scalar_only(props: mi.Properties) -> None:
             raise RequestError(f"{name}: got {got}, wanted none with theory=rigorous: {advice}")
 
 
-def check_parameters(props: mi.Properties, spectrum: RigorousSpectrum, coat: Coat | None) -> PerfectMirror:
-    """Return R = 1, as the efficiencies of a rigorous spectrum include the material.
+def check_rigorous(spectrum: RigorousSpectrum, request: GratingRequest) -> None:
+    """Check that a rigorous spectrum is of the material, the media and the polarisation of a scene.
 
     Raises:
-        RequestError: if the scene has another material, medium or polarisation, or parameters of scalar theory alone.
+        RequestError: if it is not.
     """
+    media, stated = request.media, request.stated
+    coat = media.coat
+    if media.outside > 1 and coat is None:
+        raise RequestError(f"ext_ior: got {media.outside:g} with theory=rigorous, wanted air or a coat")
+    _check_transmission(spectrum.transmission, media)
     if mi.is_polarized and spectrum.mueller is None:
         raise RequestError(
             f"theory: got a rigorous spectrum of unpolarised light in the variant {mi.variant()}, wanted one that was "
             "built with polarised=True"
         )
-    refuse_scalar_only(props)
     medium = 1.0 if coat is None else coat.relative
     if abs(spectrum.settings.ext_ior - medium) > 1e-3 * medium:
         raise RequestError(
             f"coat_ior: got {'none' if coat is None else f'{coat.index:g}'}, but the rigorous spectrum is of a grating "
             f"below a medium of index {spectrum.settings.ext_ior:g}: build it with ext_ior={medium:.4g}"
         )
-    # With a coat, `ext_ior` is the index above the coat.
-    if any(name in props for name in ("material", "int_ior", *(["ext_ior"] if coat is None else []))):
-        wanted = settings_from(props, coat)
-        if is_file(material := wanted.get("material", "")):
-            same = index_of("material", material).digest == spectrum.material_digest
-        elif material:
-            same = material == spectrum.settings.material
-        else:
-            same = abs(wanted["int_ior"] - spectrum.int_ior) < 1e-3 * abs(spectrum.int_ior)
-        if not same:
-            got = " ".join(f"{name} {value}" for name, value in wanted.items())
-            raise RequestError(
-                f"material: got {got}, but the rigorous spectrum is of {spectrum.material_name}: "
-                "leave it out, or build the spectrum for this material"
-            )
-    return PerfectMirror(f"{spectrum.material_name}, in the efficiencies")
+    if stated is None:
+        return
+    if is_file(material := stated.get("material", "")):
+        same = index_of("material", material).digest == spectrum.material_digest
+    elif material:
+        same = material == spectrum.settings.material
+    else:
+        same = abs(stated["int_ior"] - spectrum.int_ior) < 1e-3 * abs(spectrum.int_ior)
+    if not same:
+        got = " ".join(f"{name} {value}" for name, value in stated.items())
+        raise RequestError(
+            f"material: got {got}, but the rigorous spectrum is of {spectrum.material_name}: "
+            "leave it out, or build the spectrum for this material"
+        )
 
 
 @dataclass(frozen=True)
@@ -417,6 +422,9 @@ class GratingRequest:
         orientation: degrees from the tangent to the pattern's x axis.
         from_radius: whether they are from the radius, away from the centre of UV space, instead.
         material: R of scalar theory.
+        stated: `material` or `int_ior` of the scene, as settings of a rigorous spectrum; None in scalar theory, and if
+            the scene leaves them to the spectrum.
+        base: below the grating, or None.
         shadowing: whether G is a factor in scalar theory.
         conserve_energy: whether E is.
         surface: a spectrum, or the recipe to compute one.
@@ -427,6 +435,8 @@ class GratingRequest:
     orientation: mi.Texture
     from_radius: bool
     material: Material
+    stated: dict[str, Any] | None
+    base: Base | None
     shadowing: bool
     conserve_energy: bool
     surface: Spectrum | Recipe
@@ -469,9 +479,15 @@ class GratingRequest:
         else:
             orientation = props.get_texture("orientation", 0.0)
         check_texture("orientation", orientation)
-        surface = surface_from(props, media, scales.max_scale)
-        material = with_film(props, reflectance_from(props, media.coat))
-        if "base" in props and not material.transparent:
+        bare = reflectance_from(props, media.coat)
+        surface, stated = surface_from(props, media, bare, scales.max_scale), None
+        if _theory_of(surface) == "rigorous":
+            _refuse_scalar_only(props)
+            # With a coat, `ext_ior` is the index above the coat.
+            if any(name in props for name in ("material", "int_ior", *(["ext_ior"] if media.coat is None else []))):
+                stated = _material_settings(props, bare, media.coat)
+        material, base = with_film(props, bare), base_from(props)
+        if base is not None and not material.transparent:
             raise RequestError("base: got a BSDF below a conductor or a perfect mirror, which transmit no light")
         shadowing = props.get("shadowing", SHADOWING[0])
         if shadowing not in SHADOWING:
@@ -479,4 +495,15 @@ class GratingRequest:
         conserve_energy = props.get("conserve_energy", True)
         if not isinstance(conserve_energy, bool):
             raise RequestError(f"conserve_energy: got {conserve_energy!r}, wanted true or false")
-        return cls(media, scales, orientation, from_radius, material, shadowing == "v_cavity", conserve_energy, surface)
+        return cls(
+            media=media,
+            scales=scales,
+            orientation=orientation,
+            from_radius=from_radius,
+            material=material,
+            stated=stated,
+            base=base,
+            shadowing=shadowing == "v_cavity",
+            conserve_energy=conserve_energy,
+            surface=surface,
+        )

@@ -24,9 +24,9 @@ from .coat import SAME_INDEX, Coat
 from .device_tables import opaque
 from .directions import Geometry, Incidence, Interface, rotated
 from .energy_factor import Coordinates, Energy
-from .fresnel import Material
+from .fresnel import Material, PerfectMirror
 from .order_sampler import MAX_INDEX_CHANGE, OrderSampler
-from .parameters import GratingRequest, Media, check_parameters, check_transmission
+from .parameters import GratingRequest, Media, check_rigorous
 from .polarisation import Split, of_facets, of_orders
 from .rigorous_orders import RigorousOrders
 from .shared import SharedTables, shared
@@ -170,14 +170,14 @@ def _of_coat(coat: Coat | None) -> Interface:
     return Interface() if coat is None else Interface(coat.eta, dispersions=(coat.dispersion, None))
 
 
-def theory_of(props: mi.Properties, spectrum: Spectrum, request: GratingRequest) -> Theory:
+def theory_of(spectrum: Spectrum, request: GratingRequest) -> Theory:
     """Return the theory of a spectrum.
 
     Raises:
         RequestError: if a parameter does not match the spectrum.
     """
     if isinstance(spectrum, RigorousSpectrum):
-        return RigorousTheory(props, spectrum, request.media)
+        return RigorousTheory(spectrum, request)
     return ScalarTheory(spectrum, request)
 
 
@@ -336,12 +336,11 @@ class RigorousTheory(Theory):
     scattering: RigorousOrders
     shadowing = True  # has no effect: it is part of the efficiencies
 
-    def __init__(self, props: mi.Properties, spectrum: RigorousSpectrum, media: Media) -> None:
-        self.media, coat = media, media.coat
-        if media.outside > 1 and coat is None:
-            raise RequestError(f"ext_ior: got {media.outside:g} with theory=rigorous, wanted air or a coat")
-        check_transmission(spectrum.transmission, media)
-        self.material = check_parameters(props, spectrum, coat)
+    def __init__(self, spectrum: RigorousSpectrum, request: GratingRequest) -> None:
+        check_rigorous(spectrum, request)
+        self.media = media = request.media
+        coat = media.coat
+        self.material = PerfectMirror(f"{spectrum.material_name}, in the efficiencies")
         self.scattering = shared((mi.variant(), spectrum.digest), lambda: RigorousOrders(spectrum))
         if media.eta is None:
             self.interface = _of_coat(coat)
