@@ -20,7 +20,7 @@ from mkdocs.commands.build import build
 from mkdocs.config import load_config
 
 import mitsuba_diffraction as md
-from mitsuba_diffraction.evaluation.realtime_shader.quirks import Quirks
+from mitsuba_diffraction.shader_2014.quirks import Quirks
 
 ROOT = Path(__file__).parents[1]
 PACKAGE = Path(md.__file__).parent

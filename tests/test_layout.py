@@ -42,7 +42,7 @@ LEVELS = (
     ("viewer",),
     ("registration",),
     ("cli", "__main__"),
-    ("evaluation",),
+    ("shader_2014", "evaluation"),
 )
 LEVEL_OF = {name: level for level, names in enumerate(LEVELS) for name in names}
 
@@ -97,7 +97,7 @@ def is_array_type(value):
 
 
 def is_command(module, name):
-    return module.endswith(f".{name}") and (".cli." in module or ".commands." in module)
+    return module.endswith(f".{name}") and any(folder in module for folder in (".cli.", ".commands.", ".command_line."))
 
 
 def repeated(pairs):
@@ -194,7 +194,7 @@ def test_the_manual_names_files_and_code_that_exist():
 
 
 def test_nothing_depends_on_what_judges_the_product():
-    judges = "mitsuba_diffraction.evaluation"
+    judges = "mitsuba_diffraction.evaluation", "mitsuba_diffraction.shader_2014"
     for module in MODULES:
         if not module.startswith(judges):
             assert not any(found.startswith(judges) for found in imports(module)), module
@@ -205,14 +205,14 @@ def test_only_the_doors_import_by_name():
     """Registration makes a plugin when a scene first has one, and the command line knows what judges the product."""
     found = {module.partition(".")[2]: names for module in MODULES if (names := imports_by_name(module))}
     home = found.pop("")
-    assert not any(name.startswith("evaluation") for name in home)
+    assert not any(name.startswith(("evaluation", "shader_2014")) for name in home)
     assert found == {
         "registration.plugins": {
             "bsdf.diffraction_grating",
-            "evaluation.realtime_shader.diffraction_shader",
+            "shader_2014.diffraction_shader",
             "integrator.diffraction_path",
         },
-        "cli": {"evaluation.commands"},
+        "cli": {"evaluation.commands", "shader_2014.command_line"},
     }
 
 

@@ -48,12 +48,12 @@ class _Command(TyperCommand):
 
 
 app = typer.Typer()
-# Imported by name, as no module of the product may depend on `evaluation`.
-_EVALUATION_COMMANDS = ("compare", "convergence", "validate", "benchmark")
-_evaluation = (
-    getattr(importlib.import_module(f"..evaluation.commands.{n}", __name__), n) for n in _EVALUATION_COMMANDS
+# Imported by name, as no module of the product may depend on what judges it.
+_JUDGES = {"shader_2014.command_line": ("compare", "convergence"), "evaluation.commands": ("validate", "benchmark")}
+_judging = (
+    getattr(importlib.import_module(f"..{folder}.{n}", __name__), n) for folder, names in _JUDGES.items() for n in names
 )
-for _command in (inspect, design, precompute, render, view, efficiency, export, hologram, examples, *_evaluation):
+for _command in (inspect, design, precompute, render, view, efficiency, export, hologram, examples, *_judging):
     app.command(cls=_Command)(_command)
 
 

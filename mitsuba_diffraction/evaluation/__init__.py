@@ -1,4 +1,4 @@
-"""Evaluation of the product: validation, benchmark, and comparison with the real-time shader.
+"""Evaluation of the product: is it right (validation), and fast (benchmark)?
 
 Imports nothing, so that its offline modules do not load Mitsuba.
 """

@@ -21,7 +21,7 @@ from .wrapped_functions import classes, making, wrap_functions
 PLUGINS = (
     ("diffraction_grating", "register_bsdf", "bsdf.diffraction_grating"),
     ("diffraction_path", "register_integrator", "integrator.diffraction_path"),
-    ("diffraction_shader", "register_integrator", "evaluation.realtime_shader.diffraction_shader"),
+    ("diffraction_shader", "register_integrator", "shader_2014.diffraction_shader"),
 )
 
 

@@ -17,7 +17,7 @@ from bsdf_support import bitmap, made_up
 
 import mitsuba_diffraction as md
 from mitsuba_diffraction.bsdf.base import gratings_in
-from mitsuba_diffraction.evaluation.comparison.pictures import same_light
+from mitsuba_diffraction.shader_2014.comparison.pictures import same_light
 
 PACKAGE = Path(md.__file__).parent
 

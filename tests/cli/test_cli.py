@@ -413,7 +413,7 @@ def test_an_error_in_a_loop_of_drjit_shows_its_cause(command, monkeypatch, llvm,
 
         dr.while_loop((dr.arange(mi.UInt32, 4),), lambda count: count < 3, body)
 
-    monkeypatch.setattr("mitsuba_diffraction.evaluation.comparison.compare", compare)
+    monkeypatch.setattr("mitsuba_diffraction.shader_2014.comparison.compare", compare)
     Path("scene.xml").write_text(SCENE)
     found, out, err = command("compare scene.xml --variant llvm_ad_spectral")
     assert (found, out, len(err.splitlines())) == (code, "", 1)

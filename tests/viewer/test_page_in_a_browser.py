@@ -15,9 +15,6 @@ from PIL import Image
 
 from mitsuba_diffraction import testing
 from mitsuba_diffraction.bsdf.directions import rotated
-from mitsuba_diffraction.evaluation.realtime_shader.diffraction_shader import PUBLISHED_BRIGHTNESS
-from mitsuba_diffraction.evaluation.realtime_shader.evaluate import VARIANTS, shader_for
-from mitsuba_diffraction.evaluation.realtime_shader.quirks import Quirks
 from mitsuba_diffraction.optics.color import (
     XYZ_to_linear_sRGB,
     delta_E,
@@ -27,6 +24,9 @@ from mitsuba_diffraction.optics.color import (
     spectrum_to_XYZ,
 )
 from mitsuba_diffraction.render import render
+from mitsuba_diffraction.shader_2014.diffraction_shader import PUBLISHED_BRIGHTNESS
+from mitsuba_diffraction.shader_2014.evaluate import VARIANTS, shader_for
+from mitsuba_diffraction.shader_2014.quirks import Quirks
 from mitsuba_diffraction.viewer import page as pages
 from mitsuba_diffraction.viewer.viewed_surface import Surface
 

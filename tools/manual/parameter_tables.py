@@ -11,9 +11,9 @@ from __future__ import annotations
 from pathlib import Path
 
 from mitsuba_diffraction.bsdf import diffraction_grating
-from mitsuba_diffraction.evaluation.realtime_shader import diffraction_shader
 from mitsuba_diffraction.integrator import diffraction_path
 from mitsuba_diffraction.plugin_parameters import Parameter
+from mitsuba_diffraction.shader_2014 import diffraction_shader
 
 PAGE = Path(__file__).parents[2] / "docs" / "plugin.md"
 PLUGINS = {module.__name__.rpartition(".")[2]: module for module in (diffraction_path, diffraction_shader)}

@@ -11,8 +11,8 @@ from viewing_angle import MODEL, relative_reflectance, wavelengths
 
 from mitsuba_diffraction.bsdf.testing import direction
 from mitsuba_diffraction.errors import RequestError
-from mitsuba_diffraction.evaluation.realtime_shader.evaluate import VARIANTS, colour
 from mitsuba_diffraction.optics.color import auto_exposure, daylight, into_gamut, on_screen, spectrum_to_linear_sRGB
+from mitsuba_diffraction.shader_2014.evaluate import VARIANTS, colour
 
 Array = NDArray[np.float64]
 

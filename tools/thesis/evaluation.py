@@ -29,9 +29,9 @@ from viewing_angle import (
 )
 
 from mitsuba_diffraction.evaluation.plots import figure, save_png
-from mitsuba_diffraction.evaluation.realtime_shader.quirks import Quirks
 from mitsuba_diffraction.evaluation.report import markdown, save_markdown
 from mitsuba_diffraction.progress import Progress, progress_bar, silent
+from mitsuba_diffraction.shader_2014.quirks import Quirks
 from mitsuba_diffraction.variants import choose_variant
 
 import mitsuba as mi  # isort: skip  (after LLVM has been chosen)

@@ -17,8 +17,8 @@ from published_surfaces import SURFACES
 from scipy.special import diric, gammaln
 
 from mitsuba_diffraction.evaluation.plots import figure, save_png
-from mitsuba_diffraction.evaluation.realtime_shader.flss import FLSS
-from mitsuba_diffraction.evaluation.realtime_shader.taylor_textures import MAX_TEXTURE_KAPPA, taylor_transforms
+from mitsuba_diffraction.shader_2014.flss import FLSS
+from mitsuba_diffraction.shader_2014.taylor_textures import MAX_TEXTURE_KAPPA, taylor_transforms
 from mitsuba_diffraction.surface.heightfield import HeightField
 
 if TYPE_CHECKING:

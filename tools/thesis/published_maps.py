@@ -27,9 +27,6 @@ from viewing_angle import MODEL, relative_reflectance, wavelengths
 from mitsuba_diffraction.bsdf.testing import array, vectors
 from mitsuba_diffraction.evaluation.benchmark.cases import scan
 from mitsuba_diffraction.evaluation.plots import figure
-from mitsuba_diffraction.evaluation.realtime_shader.evaluate import shader_for
-from mitsuba_diffraction.evaluation.realtime_shader.quirks import Quirks
-from mitsuba_diffraction.evaluation.realtime_shader.tristimulus import WAVELENGTH_STEP, d65_weights, rgb_matrix
 from mitsuba_diffraction.evaluation.report import markdown, save_markdown
 from mitsuba_diffraction.files.outputs import METADATA
 from mitsuba_diffraction.files.writing import whole_file
@@ -37,6 +34,9 @@ from mitsuba_diffraction.precomputation.recipe import Recipe
 from mitsuba_diffraction.progress import Progress, progress_bar, show, silent
 from mitsuba_diffraction.progress import table as progress_table
 from mitsuba_diffraction.settings import ScalarSettings
+from mitsuba_diffraction.shader_2014.evaluate import shader_for
+from mitsuba_diffraction.shader_2014.quirks import Quirks
+from mitsuba_diffraction.shader_2014.tristimulus import WAVELENGTH_STEP, d65_weights, rgb_matrix
 from mitsuba_diffraction.surface.heightfield import HeightField
 from mitsuba_diffraction.variants import choose_variant
 

@@ -14,9 +14,9 @@ import numpy as np
 from numpy.typing import NDArray
 from PIL import Image
 
-from mitsuba_diffraction.evaluation.comparison.pictures import Pictures
 from mitsuba_diffraction.evaluation.plots import figure, save_png
 from mitsuba_diffraction.optics.color import XYZ_to_linear_sRGB, auto_exposure, into_gamut, on_screen
+from mitsuba_diffraction.shader_2014.comparison.pictures import Pictures
 from mitsuba_diffraction.variants import choose_variant
 
 import mitsuba as mi  # isort: skip  (after LLVM has been chosen)

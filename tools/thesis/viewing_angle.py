@@ -19,9 +19,9 @@ from scipy.signal import find_peaks
 
 from mitsuba_diffraction import testing
 from mitsuba_diffraction.errors import RequestError
-from mitsuba_diffraction.evaluation.realtime_shader.evaluate import relative_radiance
-from mitsuba_diffraction.evaluation.realtime_shader.quirks import Quirks
 from mitsuba_diffraction.precomputation.grating_spectrum import GratingSpectrum
+from mitsuba_diffraction.shader_2014.evaluate import relative_radiance
+from mitsuba_diffraction.shader_2014.quirks import Quirks
 from mitsuba_diffraction.variants import is_supported
 
 import mitsuba as mi  # isort: skip  (after LLVM has been chosen)
@@ -128,7 +128,7 @@ def reflectance_map(
     """Evaluate a surface over viewing angle and wavelength.
 
     The model is evaluated by `relative_reflectance`; the shader by
-    `realtime_shader.evaluate.relative_radiance`. At a viewing angle, NMM has only the wavelengths
+    `shader_2014.evaluate.relative_radiance`. At a viewing angle, NMM has only the wavelengths
     λ_n = T (sin θ_i + sin θ_r)/n, T being the length of the tile. Conversely, it has a wavelength only at the angles of
     the tile's orders, where it equals FLSS. These are the angles of its map.
 

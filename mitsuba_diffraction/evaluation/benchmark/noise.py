@@ -27,7 +27,7 @@ from ...render.spectral_film import channel_wavelengths, replace_films
 from ...render.sums import Accumulation
 from ...render.trace_pass import pass_seed, trace_pass
 from ...settings import VISIBLE
-from ..comparison.series import shows_gratings
+from ...shader_2014.comparison.series import shows_gratings
 from .measured import write_measured
 from .perfect_sampling import sample_perfectly
 

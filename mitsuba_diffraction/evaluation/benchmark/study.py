@@ -17,14 +17,15 @@ from ...files.writing import whole_file
 from ...precomputation.grating_spectrum import GratingSpectrum
 from ...progress import Progress, silent, table
 from ...settings import VISIBLE, ScalarSettings
+from ...shader_2014 import shader_speed
+from ...shader_2014.shader_speed import ShaderSpeed, shader_speeds
 from ...spectrum.tables import SliceTable
 from .. import report
-from . import sampling, shader_speed
+from . import sampling
 from .accuracy import Accuracy, Exact
 from .cases import Case
 from .measured import measured_bsdf
 from .sampling import Sampling
-from .shader_speed import ShaderSpeed, shader_speeds
 from .speed import Rays, seconds
 
 TOLERANCES = (1e-2, 1e-3)

@@ -77,7 +77,7 @@ def benchmark(
 
 
 def _measure_terms(json: Path | None, plot: Path | None) -> None:
-    from ..benchmark import terms
+    from ...shader_2014 import terms
     from ..benchmark.cases import TIMED_TILES, tiles
     from ..benchmark.speed import machine
     from ..plots import save_png

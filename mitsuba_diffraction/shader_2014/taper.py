@@ -20,8 +20,8 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from ...spectrum.sample import effective_coherence_length, window_axes
-from ...surface.heightfield import HeightField
+from ..spectrum.sample import effective_coherence_length, window_axes
+from ..surface.heightfield import HeightField
 
 
 def tapered(height_field: HeightField, coherence_length: float) -> tuple[NDArray[np.float64], tuple[float, float]]:

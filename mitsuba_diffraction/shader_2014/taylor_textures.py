@@ -11,9 +11,9 @@ import scipy.fft
 from numpy.typing import NDArray
 from scipy.special import gammaln
 
-from ...bsdf.device_tables import PacketTable, opaque
-from ...errors import RequestError
-from ...surface.heightfield import HeightField
+from ..bsdf.device_tables import PacketTable, opaque
+from ..errors import RequestError
+from ..surface.heightfield import HeightField
 from .tristimulus import FIRST_WAVELENGTH
 
 MAX_TEXTURE_KAPPA = 4e3 * np.pi / FIRST_WAVELENGTH  # rad/µm, at normal incidence

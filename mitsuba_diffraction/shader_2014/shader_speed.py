@@ -9,16 +9,16 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from ...bsdf.testing import vectors
-from ...optics.color import SRGB_TO_XYZ
-from ...optics.geometry import k_g
-from ..realtime_shader.evaluate import shader_for
-from ..realtime_shader.quirks import Quirks
-from ..realtime_shader.shader import Shader
-from ..realtime_shader.tristimulus import PUBLISHED_R0
-from .accuracy import Exact, patch_difference, patch_directions
-from .cases import Case
-from .speed import Rays, seconds
+from ..bsdf.testing import vectors
+from ..evaluation.benchmark.accuracy import Exact, patch_difference, patch_directions
+from ..evaluation.benchmark.cases import Case
+from ..evaluation.benchmark.speed import Rays, seconds
+from ..optics.color import SRGB_TO_XYZ
+from ..optics.geometry import k_g
+from .evaluate import shader_for
+from .quirks import Quirks
+from .shader import Shader
+from .tristimulus import PUBLISHED_R0
 
 _SHADERS = (("flss", "as published"), ("flss", "corrected"), ("nmm", "as published"), ("pq", "as published"))
 

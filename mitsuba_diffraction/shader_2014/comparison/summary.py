@@ -7,9 +7,9 @@ import dataclasses
 import numpy as np
 from rich.table import Table
 
+from ...evaluation import report
 from ...progress import table
-from .. import report
-from ..realtime_shader.diffraction_shader import PUBLISHED_BRIGHTNESS
+from ..diffraction_shader import PUBLISHED_BRIGHTNESS
 from .pictures import NO_SHADOWS
 from .quirk_shares import MIN_EFFECT, QuirkShares
 from .side_by_side import Comparison

@@ -27,9 +27,9 @@ from viewing_angle import (
 )
 
 import mitsuba_diffraction as md
-from mitsuba_diffraction.evaluation.realtime_shader.evaluate import relative_radiance
-from mitsuba_diffraction.evaluation.realtime_shader.quirks import Quirks
 from mitsuba_diffraction.settings import ScalarSettings
+from mitsuba_diffraction.shader_2014.evaluate import relative_radiance
+from mitsuba_diffraction.shader_2014.quirks import Quirks
 
 ROOT = Path(__file__).parents[2]
 BLAZE = SURFACES["blaze"]

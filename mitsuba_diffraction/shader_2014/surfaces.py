@@ -9,12 +9,12 @@ from dataclasses import dataclass
 import drjit as dr
 import mitsuba as mi
 
-from ...bsdf.base import gratings_in, is_grating, parts
-from ...bsdf.directions import rotated
-from ...bsdf.layers import Layers
-from ...errors import RequestError
-from ...precomputation.recipe import Recipe
-from ...rigorous.rigorous_spectrum import RigorousSpectrum
+from ..bsdf.base import gratings_in, is_grating, parts
+from ..bsdf.directions import rotated
+from ..bsdf.layers import Layers
+from ..errors import RequestError
+from ..precomputation.recipe import Recipe
+from ..rigorous.rigorous_spectrum import RigorousSpectrum
 from .shader import Shader, SpectralWeights
 
 _MAX_MASKS = 16  # that a ray passes

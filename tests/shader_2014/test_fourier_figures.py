@@ -7,7 +7,7 @@ from fourier_figures import extrema, interpolated, tile_transform
 from PIL import Image
 
 import mitsuba_diffraction as md
-from mitsuba_diffraction.evaluation.realtime_shader.taylor_textures import taylor_transforms
+from mitsuba_diffraction.shader_2014.taylor_textures import taylor_transforms
 
 
 @pytest.mark.parametrize("count", [40, 41])

@@ -9,8 +9,8 @@ import mitsuba as mi
 import numpy as np
 import scipy.fft
 
-from ...errors import RequestError
-from ...surface.heightfield import HeightField
+from ..errors import RequestError
+from ..surface.heightfield import HeightField
 from .quirks import Quirks
 from .shader import Shader, SpectralWeights
 

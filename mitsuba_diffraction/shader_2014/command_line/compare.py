@@ -61,7 +61,7 @@ def compare(
     from ..comparison import compare as run
     from ..comparison import figure, summary
     from ..comparison.pictures import supported_lights
-    from ..realtime_shader.diffraction_shader import checked_brightness
+    from ..diffraction_shader import checked_brightness
 
     number = None if brightness == "auto" else checked_brightness(_number(brightness))
     parameters, name = scene_parameters(define), scene.stem

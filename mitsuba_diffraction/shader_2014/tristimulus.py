@@ -10,9 +10,9 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from scipy.optimize import lsq_linear
 
-from ...bsdf.device_tables import PacketTable
-from ...optics.color import SRGB_TO_XYZ, XYZ_TO_SRGB, daylight, matching_functions
-from ...settings import VISIBLE
+from ..bsdf.device_tables import PacketTable
+from ..optics.color import SRGB_TO_XYZ, XYZ_TO_SRGB, daylight, matching_functions
+from ..settings import VISIBLE
 from .quirks import Quirks
 
 FIRST_WAVELENGTH, LAST_WAVELENGTH, WAVELENGTH_STEP = 380.0, 780.0, 5.0  # nm

@@ -11,10 +11,10 @@ import mitsuba as mi
 import numpy as np
 from numpy.typing import ArrayLike
 
-from ...bsdf.device_tables import larger, opaque
-from ...optics.geometry import k_g
-from ...settings import SUN_COHERENCE_LENGTH, lobe_width
-from ...surface.heightfield import HeightField
+from ..bsdf.device_tables import larger, opaque
+from ..optics.geometry import k_g
+from ..settings import SUN_COHERENCE_LENGTH, lobe_width
+from ..surface.heightfield import HeightField
 from .quirks import Quirks
 from .taper import tapered
 from .taylor_textures import MAX_TEXTURE_KAPPA, TaylorTextures, taylor_transforms, terms_for

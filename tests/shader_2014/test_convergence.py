@@ -9,7 +9,12 @@ from PIL import Image
 from test_comparison import GRATING, SUN, write
 
 import mitsuba_diffraction  # noqa: F401 (settles which LLVM is used before a variant is set)
-from mitsuba_diffraction.evaluation.comparison.convergence import Convergence, Point, convergence, save_convergence_plot
+from mitsuba_diffraction.shader_2014.comparison.convergence import (
+    Convergence,
+    Point,
+    convergence,
+    save_convergence_plot,
+)
 
 WITH_TOLERANCE = GRATING.format(profile="blazed", period=2.0, coherence=3.0, base="").replace(
     "</bsdf>", '<float name="tolerance" value="$tolerance"/></bsdf>'

@@ -8,10 +8,10 @@ import mitsuba as mi
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from ...bsdf.testing import array, vectors
-from ...errors import RequestError
-from ...surface.heightfield import HeightField
-from ...variants import is_supported
+from ..bsdf.testing import array, vectors
+from ..errors import RequestError
+from ..surface.heightfield import HeightField
+from ..variants import is_supported
 from .flss import FLSS
 from .gem import GEM
 from .nmm import NMM

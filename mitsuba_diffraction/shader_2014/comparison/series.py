@@ -32,7 +32,7 @@ from ...render.spectral_film import channel_wavelengths
 from ...render.sums import Accumulation
 from ...render.trace_pass import pass_seed, trace_pass
 from ...settings import ORIGINS, SERIES, ScalarSettings
-from ..realtime_shader.surfaces import gratings_of
+from ..surfaces import gratings_of
 from .difference import as_shown, white_luminance
 from .pictures import Picture
 

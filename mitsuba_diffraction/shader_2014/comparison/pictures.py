@@ -26,14 +26,14 @@ from ...render.spectral_film import channel_wavelengths
 from ...render.sums import Accumulation, ratio
 from ...render.trace_pass import check_memory, collect, equal_ranges, pass_seed, rotated_sampler, sampler_of, trace_pass
 from ...settings import VISIBLE
-from ..realtime_shader import tristimulus
-from ..realtime_shader.diffraction_shader import PUBLISHED_BRIGHTNESS, checked_brightness, parameters_of_variant
-from ..realtime_shader.flss import FLSS
-from ..realtime_shader.lights import lights_of
-from ..realtime_shader.quirks import Quirks
-from ..realtime_shader.shader import Shader, TextureShader
-from ..realtime_shader.surfaces import gratings_of, sum_along
-from ..realtime_shader.tristimulus import EMISSION, primary_spectra
+from .. import tristimulus
+from ..diffraction_shader import PUBLISHED_BRIGHTNESS, checked_brightness, parameters_of_variant
+from ..flss import FLSS
+from ..lights import lights_of
+from ..quirks import Quirks
+from ..shader import Shader, TextureShader
+from ..surfaces import gratings_of, sum_along
+from ..tristimulus import EMISSION, primary_spectra
 
 
 @functools.cache

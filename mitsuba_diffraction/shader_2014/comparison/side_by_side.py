@@ -15,8 +15,8 @@ from numpy.typing import NDArray
 
 from ...errors import RequestError
 from ...progress import Progress, no_progress
-from ..realtime_shader.diffraction_shader import parameters_of_variant
-from ..realtime_shader.evaluate import VARIANTS
+from ..diffraction_shader import parameters_of_variant
+from ..evaluate import VARIANTS
 from .difference import Difference, difference, noise, time_of_error, white_luminance
 from .pictures import Picture, Pictures
 from .quirk_shares import QuirkShares, quirk_shares

@@ -10,10 +10,10 @@ import typer
 
 from ...cli.arguments import Define, Overwrite, Variant, check_suffix, parse_numbers, scene_parameters
 from ...errors import RequestError
+from ...evaluation.report import cells
 from ...files import outputs
 from ...progress import progress_bar, show, table, tell
 from ...settings import ORIGINS
-from ..report import cells
 
 if TYPE_CHECKING:
     from ..comparison.series import SeriesStudy
@@ -99,8 +99,8 @@ def convergence(
 
 
 def _report_series(found: SeriesStudy, plot: Path, json: Path | None) -> None:
+    from ...evaluation.plots import save_png
     from ..comparison import series
-    from ..plots import save_png
 
     save_png(series.plot_series(found), plot)
     if json is not None:

@@ -9,8 +9,8 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from ...errors import RequestError
-from ...surface.heightfield import HeightField
+from ..errors import RequestError
+from ..surface.heightfield import HeightField
 from .quirks import Quirks
 from .shader import Gain, TextureShader
 

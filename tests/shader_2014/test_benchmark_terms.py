@@ -10,7 +10,7 @@ from rich.console import Console
 
 import mitsuba_diffraction as md
 from mitsuba_diffraction import gratings
-from mitsuba_diffraction.evaluation.benchmark import terms
+from mitsuba_diffraction.shader_2014 import terms
 from mitsuba_diffraction.evaluation.benchmark.cases import MEASURED, TIMED_TILES, Case, tiles
 from mitsuba_diffraction.evaluation.plots import save_png
 

@@ -8,8 +8,8 @@ from typing import Any, ClassVar
 import drjit as dr
 import mitsuba as mi
 
-from ...errors import RequestError
-from ...surface.heightfield import HeightField
+from ..errors import RequestError
+from ..surface.heightfield import HeightField
 from .quirks import Quirks
 from .shader import Gain, TextureShader
 

@@ -12,15 +12,15 @@ from bsdf_support import made_up
 from PIL import Image
 
 import mitsuba_diffraction as md
-from mitsuba_diffraction.evaluation.comparison import compare, figure, summary
-from mitsuba_diffraction.evaluation.comparison.difference import difference, noise, time_of_error, white_luminance
-from mitsuba_diffraction.evaluation.comparison.pictures import NO_SHADOWS, Pictures, supported_lights
-from mitsuba_diffraction.evaluation.comparison.quirk_shares import quirk_shares
-from mitsuba_diffraction.evaluation.realtime_shader.evaluate import VARIANTS
-from mitsuba_diffraction.evaluation.realtime_shader.quirks import Quirks
 from mitsuba_diffraction.optics.color import delta_E, spectrum_to_XYZ
 from mitsuba_diffraction.render.scene_file import SceneFile
 from mitsuba_diffraction.render.spectral_film import channel_wavelengths, channel_weights
+from mitsuba_diffraction.shader_2014.comparison import compare, figure, summary
+from mitsuba_diffraction.shader_2014.comparison.difference import difference, noise, time_of_error, white_luminance
+from mitsuba_diffraction.shader_2014.comparison.pictures import NO_SHADOWS, Pictures, supported_lights
+from mitsuba_diffraction.shader_2014.comparison.quirk_shares import quirk_shares
+from mitsuba_diffraction.shader_2014.evaluate import VARIANTS
+from mitsuba_diffraction.shader_2014.quirks import Quirks
 
 # A sphere above a plate, with a pigment; broad lobes, so that small pictures resolve them.
 GRATING = """<bsdf type="diffraction_grating"><string name="profile" value="{profile}"/>

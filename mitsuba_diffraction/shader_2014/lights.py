@@ -9,8 +9,8 @@ import mitsuba as mi
 import numpy as np
 from numpy.typing import NDArray
 
-from ...bsdf.testing import array, interaction
-from ...errors import RequestError
+from ..bsdf.testing import array, interaction
+from ..errors import RequestError
 from .tristimulus import wavelengths
 
 

@@ -10,11 +10,11 @@ import mitsuba as mi
 import numpy as np
 from numpy.typing import NDArray
 
-from ...bsdf.device_tables import opaque
-from ...bsdf.fresnel import Dielectric
-from ...bsdf.layers import Layers
-from ...errors import RequestError
-from ...plugin_parameters import Parameter, listed
+from ..bsdf.device_tables import opaque
+from ..bsdf.fresnel import Dielectric
+from ..bsdf.layers import Layers
+from ..errors import RequestError
+from ..plugin_parameters import Parameter, listed
 from .evaluate import VARIANTS
 from .lights import Light, lights_of, sampled_spectrum
 from .pq import PQ
@@ -32,7 +32,7 @@ PARAMETERS = (
     Parameter(
         "schlick, relative, …",
         "boolean",
-        "overrides `as_published` for one quirk; `realtime_shader.quirks.Quirks` lists them",
+        "overrides `as_published` for one quirk; `shader_2014.quirks.Quirks` lists them",
     ),
     Parameter(
         "brightness",

@@ -12,12 +12,12 @@ from scipy.special import diric
 import mitsuba_diffraction as md
 from mitsuba_diffraction.bsdf.testing import array, vectors
 from mitsuba_diffraction.errors import root_cause
-from mitsuba_diffraction.evaluation.realtime_shader import tristimulus
-from mitsuba_diffraction.evaluation.realtime_shader.evaluate import VARIANTS, colour, relative_radiance, shader_for
-from mitsuba_diffraction.evaluation.realtime_shader.nmm_pq import line_area
-from mitsuba_diffraction.evaluation.realtime_shader.pq import tile_factor, tiling_power
-from mitsuba_diffraction.evaluation.realtime_shader.quirks import Quirks
-from mitsuba_diffraction.evaluation.realtime_shader.taylor_textures import series_error, taylor_transforms
+from mitsuba_diffraction.shader_2014 import tristimulus
+from mitsuba_diffraction.shader_2014.evaluate import VARIANTS, colour, relative_radiance, shader_for
+from mitsuba_diffraction.shader_2014.nmm_pq import line_area
+from mitsuba_diffraction.shader_2014.pq import tile_factor, tiling_power
+from mitsuba_diffraction.shader_2014.quirks import Quirks
+from mitsuba_diffraction.shader_2014.taylor_textures import series_error, taylor_transforms
 
 PUBLISHED, CORRECTED = Quirks.as_published(), Quirks.corrected()
 BLAZE = md.gratings.blazed(2.5, 0.25, samples=64)
@@ -707,7 +707,7 @@ def luminance(built):
 @pytest.mark.parametrize("kind", ["normalmap", "bumpmap", "mask", "blendbsdf", "twosided"])
 def test_gratings_are_shaded_inside_other_bsdfs(kind):
     """A wrapper that changes nothing, exactly; and one that does, against this model in the same light."""
-    from mitsuba_diffraction.evaluation.comparison.pictures import same_light
+    from mitsuba_diffraction.shader_2014.comparison.pictures import same_light
 
     def constant(value):
         return {"type": "bitmap", "raw": True, "bitmap": mi.Bitmap(np.full((2, 2, 3), value, np.float32))}
