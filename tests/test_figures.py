@@ -73,7 +73,7 @@ def test_a_figure_is_renewed_whole(tmp_path, monkeypatch):
 
 def test_an_unknown_figure_is_refused_in_one_line(capsys):
     with pytest.raises(SystemExit) as stopped:
-        figures.main(["terms", "gone"])
+        figures.main(["screen", "gone"])
     assert stopped.value.code == 2
     assert "got gone, wanted names among benchmark" in capsys.readouterr().err
 

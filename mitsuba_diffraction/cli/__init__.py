@@ -53,7 +53,9 @@ _JUDGES = {"shader_2014.command_line": ("compare", "convergence"), "evaluation.c
 _judging = (
     getattr(importlib.import_module(f"..{folder}.{n}", __name__), n) for folder, names in _JUDGES.items() for n in names
 )
-for _command in (inspect, design, precompute, render, view, efficiency, export, hologram, examples, *_judging):
+# In the order of use.
+_commands_of_product = (examples, render, view, inspect, design, hologram, export, precompute, efficiency)
+for _command in (*_commands_of_product, *_judging):
     app.command(cls=_Command)(_command)
 
 

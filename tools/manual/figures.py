@@ -1,7 +1,7 @@
 """Renew figures of the manual, each by its command.
 
     python tools/manual/figures.py                    # all names, with their times
-    python tools/manual/figures.py terms gallery/window
+    python tools/manual/figures.py screen gallery/window
 
 A command writes to a temporary folder, {out}; its figures then replace those in docs/. The commands of the gallery are
 on its page. What `mitsuba-diffraction NAME` draws is in the module that `evaluation/commands/NAME.py` or `cli/NAME.py`
@@ -54,13 +54,6 @@ def notebook(file: str, name: str, cell: str, minutes: int) -> Figure:
     return Figure((file,), f"jupyter execute notebooks/{name}.ipynb --output={{out}}/notebook", minutes, cell=cell)
 
 
-def picture_error(scene: str, light: str, options: str = "") -> Figure:
-    """Return a figure of error against time of a picture."""
-    file = f"picture_error_{scene.removesuffix('_sphere')}_{light}.png"
-    options = f"-D light={light} -D depth=2 -D sky=0 {options} --width 64 --reference-spp 1024"
-    return Figure((file,), f"mitsuba-diffraction convergence scenes/{scene}.xml {options} -o {{out}}/{file}", 4)
-
-
 FIGURES = (
     Figure(("benchmark.png",), "mitsuba-diffraction benchmark --plot {out}/benchmark.png", 8),
     Figure(
@@ -92,10 +85,6 @@ FIGURES = (
         "python tools/manual/measured_figures.py {out}/measured_gratings.png {out}/measured_transmission.png",
     ),
     notebook("patch_length.png", "02_brdf_and_grating_equation", "cell-16", 6),
-    picture_error("blaze", "bulb"),
-    picture_error("blaze", "parallel"),
-    picture_error("xenopeltis_sphere", "bulb", "-D skin=xenopeltis_tile"),
-    picture_error("xenopeltis_sphere", "parallel", "-D skin=xenopeltis_tile"),
     Figure(("ready_surfaces.jpg",), "python tools/manual/contact_sheet.py {out}/ready_surfaces.png", 3),
     Figure(("removed_dust.png",), "python tools/manual/measured_skins.py {out}/removed_dust.png"),
     notebook("scalar_theory.png", "05_can_i_trust_the_picture", "cell-07", 3),
@@ -106,14 +95,7 @@ FIGURES = (
         2,
     ),
     notebook("slits.png", "02_brdf_and_grating_equation", "cell-14", 6),
-    Figure(
-        ("taylor_snake.png",),
-        """mitsuba-diffraction convergence scenes/xenopeltis.xml -D skin=xenopeltis_tile --terms 4,6,8,10,15,20 \
-            --width 192 --spp 32 -o {out}/taylor_snake.png""",
-        12,
-    ),
-    Figure(("taylor_row.png",), "python tools/manual/taylor_row.py {out}/taylor_row.png", 2),
-    Figure(("terms.png",), "mitsuba-diffraction benchmark --terms --plot {out}/terms.png", 10),
+    Figure(("taylor_row.jpg",), "python tools/manual/taylor_row.py {out}/taylor_row.png", 3),
     Figure(("published_snakes.png",), "python tools/thesis/published_snakes.py {out}/published_snakes.png", 3),
     Figure(
         ("thin_film.png", "film_stack.png"), "python tools/manual/thin_film.py {out}/thin_film.png {out}/film_stack.png"
@@ -121,9 +103,9 @@ FIGURES = (
     Figure(("fourier_images.png", "interpolation.png"), "python tools/thesis/fourier_figures.py {out}"),
     Figure(("published_heights.png", "published_maps.png"), "python tools/thesis/published_maps.py {out}", 8),
     Figure(
-        ("brdf_xenopeltis.png", "viewing_angle_elaphe_scan.png", "viewing_angle_xenopeltis_scan.png"),
-        "python tools/thesis/evaluation.py {out} xenopeltis elaphe_scan xenopeltis_scan",
-        10,
+        ("viewing_angle_elaphe_scan.png", "viewing_angle_xenopeltis_scan.png"),
+        "python tools/thesis/evaluation.py {out} elaphe_scan xenopeltis_scan",
+        8,
     ),
     Figure(
         ("viewer.png", "viewer_snake.png"),

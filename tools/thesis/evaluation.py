@@ -57,20 +57,24 @@ def plot_reflectance(maps: Sequence[ReflectanceMap]) -> Figure:
     the range of the published map. Each panel has a logarithmic scale of three decades below its maximum reflectance
     outside the specular peak.
     """
-    drawn = figure(3.1 * len(maps) + 0.9, 4.4)
-    axes = drawn.subplots(1, len(maps), sharex=True, sharey=True, squeeze=False)[0]
-    for panel, found in zip(axes, maps, strict=True):
+    columns = min(2, len(maps))
+    rows = -(-len(maps) // columns)
+    drawn = figure(3.1 * columns + 0.9, 3.1 * rows + 1.3)
+    axes = drawn.subplots(rows, columns, sharex=True, sharey=True, squeeze=False)
+    for panel, found in zip(axes.ravel(), maps, strict=True):
         image = _draw_map(panel, found)
         fit = fit_period(found)
-        panel.set_title(f"{TITLES[found.method]}\nperiod {fit.mean:.1f} ± {fit.deviation:.2f} nm", fontsize=10)
-        panel.set_xlabel("wavelength λ / nm")
+        panel.set_title(f"{TITLES[found.method]}\npeak at {fit.mean:.1f} ± {fit.deviation:.2f} nm")
     surface, incidence = maps[0].surface, maps[0].incidence
-    axes[0].set_ylabel("viewing angle θ$_r$ / °")
+    for panel in axes[-1]:
+        panel.set_xlabel("wavelength λ / nm")
+    for panel in axes[:, 0]:
+        panel.set_ylabel("viewing angle θ$_r$ / °")
     bar = drawn.colorbar(image, ax=axes, pad=0.01)
-    bar.set_label("reflectance / maximum\noutside the mirror direction")
+    bar.set_label("reflectance / maximum outside the mirror direction")
     drawn.suptitle(f"{surface.name}: light at θ$_i$ = {incidence:g}°, mirror direction at θ$_r$ = {-incidence:g}°")
-    handles, labels = axes[0].get_legend_handles_labels()
-    drawn.legend(handles, labels, loc="outside lower center", ncols=3, frameon=False)
+    handles, labels = axes[0, 0].get_legend_handles_labels()
+    drawn.legend(handles, labels, loc="outside lower center", frameon=False)
     return drawn
 
 
@@ -89,12 +93,14 @@ def _draw_map(panel: Axes, found: ReflectanceMap) -> ScalarMappable:
         image = panel.add_collection(LineCollection(steps, array=shown[:-1].ravel(), linewidths=0.9, **style))
     else:
         image = panel.pcolormesh(found.wavelengths, found.angles, shown.T, shading="nearest", **style)
-    panel.plot(found.wavelengths, peak_angles(found), color=_PEAK, linewidth=2.5, label="peak")
+    panel.plot(
+        found.wavelengths, peak_angles(found), color=_PEAK, linewidth=2.5, label="peak of this map: its brightest angle"
+    )
     period = found.surface.period
     equation = grating_equation(period, found.incidence, found.wavelengths)
     panel.plot(
         found.wavelengths, equation, color="black", linewidth=1, linestyle=(0, (4, 4)),
-        label=f"grating equation, d = {1e3 * period:g} nm",
+        label=f"order of the period that the thesis names, {1e3 * period:g} nm",
     )  # fmt: skip
     panel.set_xlim(found.wavelengths[[0, -1]])
     low, high = found.surface.angles

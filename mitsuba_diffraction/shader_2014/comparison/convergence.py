@@ -7,9 +7,10 @@ its bias.
 
 from __future__ import annotations
 
+import functools
 import os
 from collections.abc import Callable, Mapping, Sequence
-from contextlib import AbstractContextManager
+from contextlib import AbstractContextManager, suppress
 from dataclasses import dataclass
 
 import numpy as np
@@ -25,6 +26,7 @@ from .pictures import Picture, Pictures
 PICTURE_TOLERANCES = (1e-1, 1e-2, 1e-3)
 SAMPLE_COUNTS = (1, 4, 16, 64, 256)
 SHADERS = ("flss", "nmm", "pq")
+PICTURES_PER_POINT = 5  # of different seeds, whose medians count
 SAMPLES_OF_OTHERS_PER_POINT = 4  # samples of all BSDFs other than gratings, per shading point
 
 POINT_COLUMNS = {
@@ -38,7 +40,7 @@ POINT_COLUMNS = {
 
 @dataclass(frozen=True)
 class Point:
-    """Error and rendering time of a picture.
+    """Error and rendering time of a picture, each the median over `PICTURES_PER_POINT` seeds.
 
     Attributes:
         name: "tolerance 0.01" of the path tracer, or "flss, corrected".
@@ -151,27 +153,36 @@ def convergence(
     white = white_luminance(reference.xyz, of.surface)
     points = []
 
-    def add(name: str, traced: bool, picture: Picture) -> None:
-        if not picture.xyz[of.surface].any():
-            return  # with few samples per pixel it may miss all orders, and has no exposure to compare at
+    def errors(picture: Picture) -> tuple[float, float, float]:
         delta_e = difference(reference.xyz, picture.xyz, of.surface, white)
         wanted = as_shown(reference.xyz[of.surface] / white)[:, 1]
         found = as_shown(picture.xyz[of.surface] * (delta_e.exposure / white))[:, 1]
-        mse = float(((found - wanted) ** 2).sum() / (wanted**2).sum())
-        points.append(Point(name, traced, picture.samples, picture.seconds, delta_e.mean, mse))
+        return picture.seconds, delta_e.mean, float(((found - wanted) ** 2).sum() / (wanted**2).sum())
+
+    def add(name: str, traced: bool, count: int, rendered: Callable[[], Picture], source: Pictures) -> None:
+        found = []
+        for seed in range(PICTURES_PER_POINT):
+            source.seed = seed
+            # With few samples a picture may miss all orders. It then has no exposure, and a shader's no brightness.
+            with suppress(RequestError):
+                found.append(errors(rendered()))
+        if found:
+            seconds, delta_e, mse = np.median(found, axis=0).tolist()
+            points.append(Point(name, traced, count, seconds, delta_e, mse))
 
     for tolerance in tolerances:
         traced = pictures(tolerance)
         with progress(f"tolerance {tolerance:g}") as bar:
             for number, count in enumerate(samples, 1):
-                add(f"tolerance {tolerance:g}", True, traced.path_traced(count))
+                add(f"tolerance {tolerance:g}", True, count, functools.partial(traced.path_traced, count), traced)
                 bar(number, len(samples))
     for shader in shaders:
         shaded = pictures(finest, shader)
         for name, quirks in (("as published", shaded.quirks), ("corrected", ())):
             with progress(f"{shader}, {name}") as bar:
                 for number, count in enumerate(shading_points, 1):
-                    add(f"{shader}, {name}", False, shaded.shaded(quirks, count, SAMPLES_OF_OTHERS_PER_POINT * count))
+                    rendered = functools.partial(shaded.shaded, quirks, count, SAMPLES_OF_OTHERS_PER_POINT * count)
+                    add(f"{shader}, {name}", False, count, rendered, shaded)
                     bar(number, len(shading_points))
     scene = " ".join(
         [os.path.basename(scene_path), *(f"-D {key}={value}" for key, value in (parameters or {}).items())]
@@ -181,39 +192,36 @@ def convergence(
 
 
 def save_convergence_plot(found: Convergence, path: str | os.PathLike[str]) -> None:
-    """Plot both errors against time: down is more accurate, left is faster."""
+    """Plot the mean CIEDE2000 against time: down is more accurate, left is faster."""
     from matplotlib import colormaps
     from matplotlib.figure import Figure
+    from matplotlib.ticker import FuncFormatter, LogLocator, NullFormatter
 
     traced = {point.name for point in found.points if point.traced}
-    figure = Figure(figsize=(9.5, 4.6), layout="constrained")
-    panels = figure.subplots(1, 2)
-    for panel, error, label in zip(
-        panels, ("delta_e", "relative_mse"), ("mean ΔE00", "relative mean square error"), strict=True
-    ):
-        blues = iter(colormaps["Blues"](np.linspace(0.5, 0.9, len(traced))[::-1]))
-        shaders = dict(zip(SHADERS, ("#c0392b", "#d98c1f", "#6b8e23"), strict=True))
-        for name, curve in found.curves().items():
-            seconds, errors = ([getattr(point, key) for point in curve] for key in ("seconds", error))
-            if curve[0].traced:
-                panel.loglog(seconds, errors, "o-", color=next(blues), markersize=4, label=f"path tracer, {name}")
-                continue
-            colour, published = shaders[name.split(",")[0]], name.endswith("published")
-            panel.loglog(
-                seconds, errors, "s--" if published else "D:", color=colour, markersize=5, linewidth=1,
-                markerfacecolor=colour if published else "white", label=name,
-            )  # fmt: skip
-            overtaken = found.overtaken(name, error)
-            if np.isfinite(overtaken):
-                panel.plot(overtaken, min(errors), "x", color=colour, markersize=7, markeredgewidth=1.8)
-        panel.set_xlabel("seconds")
-        panel.set_ylabel(label)
-        panel.grid(alpha=0.25, which="both")
-    handles, labels = panels[0].get_legend_handles_labels()
-    figure.legend(handles, labels, loc="outside lower center", ncols=3, frameon=False, fontsize="small")
-    width, height = found.size
-    figure.suptitle(
-        f"{found.scene}\n{width} × {height} pixels; × where the path tracer overtakes a shader", fontsize=10
-    )
+    figure = Figure(figsize=(8, 7), layout="constrained")  # with text that is read at 400 pixels
+    panel = figure.subplots()
+    blues = iter(colormaps["Blues"](np.linspace(0.6, 0.9, len(traced))[::-1]))
+    shaders = dict(zip(SHADERS, ("#c0392b", "#d98c1f", "#6b8e23"), strict=True))
+    for name, curve in found.curves().items():
+        seconds, errors = ([getattr(point, key) for point in curve] for key in ("seconds", "delta_e"))
+        if curve[0].traced:
+            label = f"path tracer, {name}" if len(traced) > 1 else "path tracer"
+            panel.loglog(seconds, errors, "o-", color=next(blues), markersize=8, linewidth=3, label=label)
+            continue
+        shader, manner = name.split(", ")
+        panel.loglog(
+            seconds, errors, "s--" if manner == "as published" else "D:", color=shaders[shader], markersize=8,
+            linewidth=2, markerfacecolor=shaders[shader] if manner == "as published" else "white",
+            label=f"{shader.upper()}, {manner.removeprefix('as ')}",
+        )  # fmt: skip
+    for axis in (panel.xaxis, panel.yaxis):
+        axis.set_major_locator(LogLocator(subs=(1, 2, 5)))
+        axis.set_major_formatter(FuncFormatter(lambda x, _: f"{x:g}"))
+        axis.set_minor_formatter(NullFormatter())
+    panel.tick_params(labelsize=17)
+    panel.set_xlabel("seconds", fontsize=18)
+    panel.set_ylabel("mean difference of colour, ΔE00", fontsize=18)
+    panel.grid(alpha=0.25)
+    figure.legend(loc="outside lower center", ncols=2, frameon=False, fontsize=16)
     with whole_file(path) as temporary:
         figure.savefig(temporary, format="png", dpi=130, metadata=METADATA)
