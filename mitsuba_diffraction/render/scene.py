@@ -70,8 +70,8 @@ def unwrap_integrators(state: mi.parser.ParserState) -> None:
             node.props = mi.Properties(state.nodes[next(iter(inner.values()))].props)
 
 
-def trace_cast_light(state: mi.parser.ParserState) -> None:
-    """Replace `path` by `diffraction_path` where that supports the scene: the same picture, without fireflies."""
+def replace_path(state: mi.parser.ParserState) -> None:
+    """Replace `path` by `diffraction_path` where that supports the scene: the same picture, with less noise."""
     unsupported = any("sample_border" in node.props for node in state.nodes)
     for node in state.nodes:
         hides = mi.Properties(node.props).get("hide_emitters", False)

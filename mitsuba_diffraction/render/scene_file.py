@@ -27,7 +27,7 @@ from ..precomputation.recipe import Recipe, source_named
 from ..progress import progress_bar
 from ..variants import is_supported
 from .parser_state import children_of, resolved_file
-from .scene import instantiated, move_first_sensor, trace_cast_light, unwrap_integrators
+from .scene import instantiated, move_first_sensor, replace_path, unwrap_integrators
 from .scene_light import draw_wavelengths_of_lights
 from .scene_materials import Materials, check_materials, replace_materials, warn_of_unused_materials
 from .spectral_film import replace_films
@@ -46,7 +46,7 @@ class SceneFile:
         materials: id of a BSDF → parameters of the `diffraction_grating` that replaces it. Of a BSDF that holds others
             (`twosided`, `mask`, `normalmap`, `bumpmap`, `blendbsdf`), these are replaced; only a `twosided` around a
             grating that transmits light is removed. Below a dielectric of scalar theory the BSDF remains as `base`,
-            unless that is given; "none" stands for none. `path` becomes `diffraction_path`.
+            unless that is given; "none" stands for none.
         size: (width, height) of the full film in pixels; the crop window is scaled with it. If only one of them is
             given, the aspect ratio is preserved; by default, the size is that of the scene.
         motion: of the first sensor: an affine map of world space, 16 numbers in row-major order, applied after its
@@ -190,7 +190,7 @@ class SceneFile:
         The film becomes a `specfilm` of float32 whose channels are hat functions at `channel_wavelengths()` with areas
         of `channel_weights()`: divided by these, a channel is spectral radiance per nm, averaged over the hat. The
         channels cover visible light, or the bands of a `specfilm` that lie outside it. Size, crop and reconstruction
-        filter are taken from the scene.
+        filter are taken from the scene. `path` becomes `diffraction_path`, where that supports the scene.
 
         Raises:
             FileNotFoundError: if there is no such file.
@@ -205,8 +205,7 @@ class SceneFile:
                 warn_of_unused_materials(state, self.materials)
             replace_films(state, *self.size)
             unwrap_integrators(state)
-            if self.materials:
-                trace_cast_light(state)
+            replace_path(state)
             if self.motion is not None:
                 move_first_sensor(state, self.motion)
             scene = instantiated(config, state)

@@ -93,12 +93,11 @@ def _measure_terms(json: Path | None, plot: Path | None) -> None:
 
 def _measure_noise(json: Path | None) -> None:
     from .. import report
-    from ..benchmark.noise import BOUNDS_COLUMNS, NOISE_COLUMNS, measure_noise
+    from ..benchmark.noise import NOISE_COLUMNS, measure_noise
     from ..benchmark.speed import machine
 
     with progress_bar("noise of pictures") as progress:
-        noise, bounds = measure_noise(progress=progress)
-    for columns, rows in ((NOISE_COLUMNS, noise), (BOUNDS_COLUMNS, bounds)):
-        show(table(columns, (report.cells(columns, row) for row in rows)), width=110)
+        noise = measure_noise(progress=progress)
+    show(table(NOISE_COLUMNS, (report.cells(NOISE_COLUMNS, row) for row in noise)), width=110)
     if json is not None:
-        outputs.save_json({"machine": machine(), "noise": noise, "bounds": bounds}, json)
+        outputs.save_json({"machine": machine(), "noise": noise}, json)
