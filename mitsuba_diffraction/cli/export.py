@@ -2,22 +2,29 @@
 
 from __future__ import annotations
 
+from functools import partial
 from pathlib import Path
 from typing import Annotated, Any
 
 import typer
 
 from ..errors import RequestError
-from ..export.exported_grating import ExportedGrating
+from ..export.cycles import shader_recipe, write_shader
+from ..export.exported_grating import ExportedGrating, material_of
 from ..export.lswm import write_lswm
 from ..export.order_table import write_order_table
 from ..files.outputs import check_outputs
-from ..progress import progress_bar, tell
+from ..precomputation.grating_spectrum import GratingSpectrum
+from ..precomputation.recipe import Recipe, theory_in
+from ..precomputation.spectra import load_spectrum
+from ..progress import progress_bar, say, tell
 from ..scalar_theory.validity import scalar_error
 from .arguments import (
     Overwrite,
+    Value,
     angles_of,
     check_suffix,
+    is_film,
     options_of_scan,
     parse_numbers,
     recipe_with,
@@ -27,11 +34,12 @@ from .arguments import (
 )
 
 _OF_MATERIAL = ("theory", "material", "int_ior")
+_INPUTS = {"orientation": "Orientation", "height_scale": "HeightScale", "base": "BaseColor"}  # of the shader
+_IN_SCENES = ("coat_ior", "thin_film_ior", "thin_film_thickness", "transmission", "ext_ior", "lateral_scale", *_INPUTS)
 _RANGES = {
     ".csv": {"wavelength": "400:700:10", "angle": "0:80:5", "azimuth": "0"},
     ".json": {"wavelength": "450:650:50", "angle": "0:80:10", "azimuth": "0:360:30"},
 }
-_SUFFIXES = tuple(_RANGES)
 
 
 @takes_scan
@@ -41,14 +49,17 @@ def export(
         str,
         typer.Argument(
             metavar="SURFACE[,name=value…]",
-            help="a recipe (.toml), a profile, or a scan; name=value: theory, material, int_ior, and the parameters of "
-            "a profile",
+            help="a recipe (.toml), a profile, a scan, or for .osl a saved spectrum (.exr); name=value: theory, "
+            "material, int_ior, and the parameters of a profile",
         ),
     ],
     output: Annotated[
         Path,
         typer.Option(
-            "-o", "--output", help=".csv: the orders as a table; .json: a grating for Zemax OpticStudio and Speos"
+            "-o",
+            "--output",
+            help=".osl: a shader for Blender's Cycles; .csv: the orders as a table; .json: a grating for Zemax "
+            "OpticStudio and Speos",
         ),
     ],
     wavelength: Annotated[
@@ -65,21 +76,67 @@ def export(
 ) -> None:
     """Write a surface for another program."""
     name, values = surface_of(source)
-    check_suffix("-o", output, *_SUFFIXES)
-    suffix = output.suffix.lower()
-    given = {"wavelength": wavelength, "angle": angle, "azimuth": azimuth}
-    ranges = _RANGES[suffix] | {key: text for key, text in given.items() if text is not None}
-    wavelengths, angles = parse_numbers("--wavelength", ranges["wavelength"]), angles_of("--angle", ranges["angle"])
-    azimuths = parse_numbers("--azimuth", ranges["azimuth"])
+    check_suffix("-o", output, ".osl", *_RANGES)
+    ranges = {"wavelength": wavelength, "angle": angle, "azimuth": azimuth}
+    given = {key: text for key, text in ranges.items() if text is not None}
     of_scan, settings = options_of_scan(context), settings_of(context)
     of_spectrum: dict[str, Any] = {key: settings[key] for key in ("extent", "coherence_length") if key in settings}
-    if Path(name).suffix.lower() == ".exr":
-        raise RequestError(f"{name}: got a saved spectrum for {output}, wanted the recipe, the profile or the scan")
     parameters = {key: values.pop(key) for key in _OF_MATERIAL if key in values}
-    recipe = recipe_with(name, values, of_scan, of_spectrum)
-    check_outputs([Path(name), *recipe.files], [("-o", output)], overwrite=overwrite)
-    grating = ExportedGrating.of_recipe(recipe, source.partition(",")[0], parameters, float(wavelengths.min()) * 1e-3)
-    with progress_bar(f"orders of {name}") as progress:
+    _refuse_parameters_of_scenes(values, output)
+    title, recipe = source.partition(",")[0], None
+    if Path(name).suffix.lower() != ".exr":
+        recipe = recipe_with(name, values, of_scan, of_spectrum)
+    elif options := ", ".join([*values, *of_scan, *of_spectrum]):
+        raise RequestError(f"{name}: got {options} with a saved spectrum, wanted the recipe or the scan itself")
+    check_outputs([Path(name), *(recipe.files if recipe else [])], [("-o", output)], overwrite=overwrite)
+    if output.suffix.lower() == ".osl":
+        if given:
+            raise RequestError(f"--{', --'.join(given)}: {output} holds all directions and colours, wanted it without")
+        _write_shader(title, recipe, parameters, output)
+    elif recipe is None:
+        raise RequestError(f"{name}: got a saved spectrum for {output}, wanted the recipe, the profile or the scan")
+    else:
+        _write_orders(title, recipe, parameters, output, given)
+
+
+def _refuse_parameters_of_scenes(values: dict[str, Value], output: Path) -> None:
+    """Refuse parameters of the plugin that files for other programs do not hold, and say what does."""
+    is_shader = output.suffix.lower() == ".osl"
+    for key in _IN_SCENES:
+        if key in values:
+            instead = f"set the input {_INPUTS[key]} of the shader" if is_shader and key in _INPUTS else ""
+            instead = instead or "wanted it without; scenes and `render --material` have it"
+            raise RequestError(f"{key}: got {values[key]}, which {output} does not hold; {instead}")
+
+
+def _write_shader(title: str, recipe: Recipe | None, parameters: dict[str, Value], output: Path) -> None:
+    theory = parameters.pop("theory", recipe.settings.theory if recipe else theory_in(Path(title)))
+    if theory != "scalar":
+        raise RequestError(
+            f"{title}: got theory={theory}, and a shader for Cycles holds scalar theory: wanted theory=scalar, or a "
+            "file .csv or .json"
+        )
+    progress = partial(progress_bar, unit="%")
+    spectrum = load_spectrum(title) if recipe is None else shader_recipe(recipe).cached(progress)
+    assert isinstance(spectrum, GratingSpectrum)
+    chosen = recipe.settings.chosen if recipe else {}
+    if is_film(title) or chosen.get("transmission", "none") != "none":
+        say("note", f"{title}: the shader shows the light that it reflects; `render` shows what it transmits")
+    held = write_shader(spectrum, output, *material_of(chosen, parameters))
+    if spectrum.warning:
+        tell(f"! {spectrum.warning}")
+    tell(f"{output}: {spectrum.source}; {held}")
+
+
+def _write_orders(
+    title: str, recipe: Recipe, parameters: dict[str, Value], output: Path, given: dict[str, str]
+) -> None:
+    suffix = output.suffix.lower()
+    ranges = _RANGES[suffix] | given
+    wavelengths, angles = parse_numbers("--wavelength", ranges["wavelength"]), angles_of("--angle", ranges["angle"])
+    azimuths = parse_numbers("--azimuth", ranges["azimuth"])
+    grating = ExportedGrating.of_recipe(recipe, title, parameters, float(wavelengths.min()) * 1e-3)
+    with progress_bar(f"orders of {title}") as progress:
         if suffix == ".csv":
             rows = write_order_table(grating, output, wavelengths, angles, azimuths, progress)
             what = f"{rows:,} rows"

@@ -74,8 +74,6 @@ class ExportedGrating:
     def __post_init__(self) -> None:
         if self.theory not in THEORIES:
             raise RequestError(f"theory: got {self.theory!r}, wanted one of {', '.join(THEORIES)}")
-        if self.material is not None and self.int_ior is not None:
-            raise RequestError(f"material: got {self.material!r} and int_ior {self.int_ior}, wanted one of the two")
         self.index(self.shortest)
 
     @classmethod
@@ -96,17 +94,13 @@ class ExportedGrating:
                 f"{name}: got an irregular surface, which has no orders, wanted a grating; `efficiency {name} --csv` "
                 "tabulates its peaks, and a file .osl holds its spectrum"
             )
-        chosen = recipe.settings.chosen
-        given = {key: parameters[key] for key in ("material", "int_ior") if key in parameters}
-        material_of = given or {key: chosen[key] for key in ("material", "int_ior") if key in chosen}
         field = recipe.height_field()
         if is_profile(field):
             field = HeightField(field.heights[:1], field.pixel_size, field.source)
         return cls(
             field,
             parameters.get("theory", recipe.settings.theory),
-            material_of.get("material"),
-            material_of.get("int_ior", None if "material" in material_of else 1.5),
+            *material_of(recipe.settings.chosen, parameters),
             shortest,
         )
 
@@ -152,6 +146,20 @@ class ExportedGrating:
             if self.theory == "scalar":
                 orders = Orders(orders.m, orders.s / total, orders.p / total)
             yield DiffractedSide(side, orders, light.directions(orders, self.period, side == "reflected"), amplitudes)
+
+
+def material_of(chosen: Mapping[str, Any], parameters: Mapping[str, Any]) -> tuple[str | None, complex | str | None]:
+    """Return (material, int_ior), one of them None, from parameters or else those chosen in a recipe; n = 1.5 of none.
+
+    Raises:
+        ValueError: if both are given.
+    """
+    tables: list[Mapping[str, Any]] = [parameters, chosen, {"int_ior": 1.5}]
+    given = next(table for table in tables if {"material", "int_ior"} & table.keys())
+    material, int_ior = given.get("material"), given.get("int_ior")
+    if material is not None and int_ior is not None:
+        raise RequestError(f"material: got {material!r} and int_ior {int_ior}, wanted one of the two")
+    return material, int_ior
 
 
 def checked_ranges(wavelengths: ArrayLike, angles: ArrayLike, azimuths: ArrayLike) -> tuple[Array, Array, Array]:

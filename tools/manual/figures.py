@@ -71,6 +71,12 @@ FIGURES = (
             --shader pq --shader gem --width 516 --spp 64 --shading-points 2 -o {out}/compare""",
         20,
     ),
+    Figure(
+        ("cycles.png",),
+        "python tools/manual/cycles_figure.py {out}/cycles.png",
+        6,
+        needs="a Python with bpy as $BLENDER_PYTHON (tools/manual/cycles_picture.py)",
+    ),
     Figure(("design.png",), "mitsuba-diffraction design precompute/designed/cat.png -o {out}/design.gsf"),
     Figure(("eye_chart.png",), "python tools/manual/eye_chart.py {out}/eye_chart.png"),
     Figure(

@@ -1,0 +1,119 @@
+"""Renders a shader of `mitsuba-diffraction export` in Cycles, by Blender's Python package, and saves linear sRGB.
+
+Run it by a Python that has bpy (`pip install bpy==4.5.15`, Python 3.11), and NumPy, which comes with it:
+
+    python tools/manual/cycles_picture.py SHADER.osl plane|sphere|disc RADIUS|sky SAMPLES SIZE OUT.npy
+
+The wheel has no `oslquery`, by which Blender's window finds the sockets of a shader; they are added by hand here. The
+scene is that of `scene` in tests/export/test_cycles.py.
+"""
+
+import contextlib
+import math
+import os
+import sys
+import time
+
+import bpy
+import numpy as np
+
+INPUTS = (
+    ("HeightScale", "NodeSocketFloat", 1.0),
+    ("Orientation", "NodeSocketFloat", 0.0),
+    ("Radial", "NodeSocketInt", 0),
+    ("Tangent", "NodeSocketVector", (0.0, 0.0, 0.0)),
+    ("Roughness", "NodeSocketFloat", 1.0),
+    ("Tint", "NodeSocketColor", (1.0, 1.0, 1.0, 1.0)),
+    ("BaseColor", "NodeSocketColor", (0.0, 0.0, 0.0, 1.0)),
+)
+
+
+def material_of(shader):
+    """A material with the Script node of a shader, and the node."""
+    import _cycles
+
+    compiled = f"{os.path.splitext(shader)[0]}.oso"
+    if not _cycles.osl_compile(shader, compiled):
+        sys.exit(f"{shader}: it does not compile")
+    material = bpy.data.materials.new("grating")
+    material.use_nodes = True
+    nodes = material.node_tree.nodes
+    nodes.clear()
+    script = nodes.new("ShaderNodeScript")
+    script.mode = "EXTERNAL"
+    script.filepath = compiled
+    for name, kind, value in INPUTS:
+        script.inputs.new(kind, name).default_value = value
+    script.outputs.new("NodeSocketShader", "BSDF")
+    output = nodes.new("ShaderNodeOutputMaterial")
+    material.node_tree.links.new(script.outputs["BSDF"], output.inputs["Surface"])
+    return material, script
+
+
+def emission(strength):
+    material = bpy.data.materials.new("lamp")
+    material.use_nodes = True
+    nodes = material.node_tree.nodes
+    nodes.clear()
+    emitter, output = nodes.new("ShaderNodeEmission"), nodes.new("ShaderNodeOutputMaterial")
+    emitter.inputs["Strength"].default_value = strength
+    material.node_tree.links.new(emitter.outputs[0], output.inputs["Surface"])
+    return material
+
+
+def build(shader, shape, light, samples, size):
+    """A square, a sphere or a disc with grooves around it, below a lamp of radiance 100 or under a sky of 1."""
+    bpy.ops.wm.read_factory_settings(use_empty=True)
+    scene = bpy.context.scene
+    scene.render.engine = "CYCLES"
+    cycles = scene.cycles
+    cycles.device, cycles.shading_system, cycles.samples, cycles.max_bounces = "CPU", True, samples, 1
+    cycles.use_adaptive_sampling, cycles.use_denoising, cycles.sample_clamp_indirect = False, False, 0
+    cycles.pixel_filter_type = "BOX"
+    scene.render.resolution_x = scene.render.resolution_y = size
+    scene.render.image_settings.file_format, scene.render.image_settings.color_depth = "OPEN_EXR", "32"
+    scene.render.threads_mode, scene.render.threads = "FIXED", 2
+    material, script = material_of(shader)
+    if shape == "sphere":
+        bpy.ops.mesh.primitive_uv_sphere_add(radius=1, segments=256, ring_count=128)
+        bpy.ops.object.shade_smooth()
+        tangent = material.node_tree.nodes.new("ShaderNodeTangent")
+        tangent.direction_type, tangent.axis = "RADIAL", "Z"
+        material.node_tree.links.new(tangent.outputs[0], script.inputs["Tangent"])
+    else:
+        bpy.ops.mesh.primitive_plane_add(size=2)
+        script.inputs["Radial"].default_value = int(shape == "disc")
+    bpy.context.object.data.materials.append(material)
+    world = scene.world = bpy.data.worlds.new("world")
+    world.use_nodes = True
+    grey = 1.0 if light == "sky" else 0.0
+    world.node_tree.nodes["Background"].inputs[0].default_value = (grey, grey, grey, 1)
+    if light != "sky":
+        bpy.ops.mesh.primitive_circle_add(
+            vertices=64, radius=float(light), fill_type="NGON", location=(0, -1, 3), rotation=(math.pi, 0, 0)
+        )
+        bpy.context.object.data.materials.append(emission(100))
+    bpy.ops.object.camera_add(location=(0, 0, 4))
+    scene.camera = bpy.context.object
+    scene.camera.data.angle = math.radians(40)
+    return scene
+
+
+def main(shader, shape, light, samples, size, out):
+    scene = build(shader, shape, light, int(samples), int(size))
+    scene.render.filepath = f"{os.path.splitext(out)[0]}.exr"
+    began = time.process_time()
+    bpy.ops.render.render(write_still=True)
+    seconds = time.process_time() - began
+    image = bpy.data.images.load(scene.render.filepath)
+    values = np.empty(4 * int(size) ** 2, np.float32)
+    image.pixels.foreach_get(values)
+    np.save(out, values.reshape(int(size), int(size), 4)[::-1, :, :3])
+    print(f"{out}: {seconds:.1f} s of processor time")
+
+
+if __name__ == "__main__":
+    main(*map(os.path.abspath, sys.argv[1:2]), *sys.argv[2:6], os.path.abspath(sys.argv[6]))
+    with contextlib.suppress(OSError):
+        sys.stdout.flush()
+    os._exit(0)  # its add-ons print tracebacks when they are freed
