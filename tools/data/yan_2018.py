@@ -1,9 +1,9 @@
 """Compares the program of Yan et al. 2018 with this model: `python tools/data/yan_2018.py GENBRDF`.
 
 GENBRDF is the program that github.com/lingqi/WaveOpticsBrdf builds (with Eigen and OpenEXR; with Eigen 3.4 its types
-Vector2 and Vector3 need other names). It reads heights in units of a texel, in half precision, of a square whose side is
-a power of two (of another it leaves out a part), and returns the BRDF of a perfect mirror at one place of the surface,
-seen through a Gaussian window: |∫ a e^{iκh} e^{−2πi q·x} dx|²/λ², with `RGHS` times (cos θ_i + cos θ_o)²/(4 cos θ_i
+Vector2 and Vector3 need other names). It reads heights in units of a texel, in half precision, of a square whose side
+is a power of two (of another it leaves out a part), and returns the BRDF of a perfect mirror at one place of it, seen
+through a Gaussian window: |∫ a e^{iκh} e^{−2πi q·x} dx|²/λ², with `RGHS` times (cos θ_i + cos θ_o)²/(4 cos θ_i
 cos θ_o). It sums Gabor kernels, one for each texel, with the slope there; here the same integral is summed pixel by
 pixel in float64, and is averaged over the places as S(q; κ) is.
 
