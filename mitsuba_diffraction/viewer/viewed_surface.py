@@ -9,6 +9,8 @@ from dataclasses import dataclass, fields, replace
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
 from ..errors import RequestError, did_you_mean, is_number
 from ..files.writing import examples_folder
 from ..optics.materials import refractive_index
@@ -147,7 +149,9 @@ class Surface:
         if recipe.settings.theory == "rigorous":  # before its table is computed
             raise RequestError(f"{name}: got theory=rigorous, wanted a surface of scalar theory")
         if not command and material.coat_ior > 1 and recipe.settings.wavelengths == VISIBLE:
-            settings = replace(recipe.settings, wavelengths=wavelengths_inside(material.coat_ior / AIR))
+            # Of indices in single precision, as Mitsuba has them, so that a scene finds the same spectrum in the cache.
+            index = float(np.float32(material.coat_ior)) / float(np.float32(AIR))
+            settings = replace(recipe.settings, wavelengths=wavelengths_inside(index))
             recipe = replace(recipe, settings=settings)
         spectrum = recipe.cached(progress)
         assert isinstance(spectrum, GratingSpectrum)

@@ -175,6 +175,23 @@ def test_the_light_and_the_observer_are_those_of_colour_science():
     np.testing.assert_allclose(table[:, 3], light / (light @ wanted[:, 1]), rtol=1e-5)
 
 
+def test_a_page_and_a_scene_share_the_spectrum_of_a_disc(llvm, monkeypatch):
+    import mitsuba as mi
+
+    asked = []
+
+    def cached(recipe, *args):
+        asked.append(recipe)
+        raise ValueError("asked")
+
+    monkeypatch.setattr(md.Recipe, "cached", cached)
+    with pytest.raises(ValueError, match="asked"):
+        Surface.named("compact_disc", {})
+    with pytest.raises(RuntimeError, match="asked"):
+        mi.load_dict({"type": "diffraction_grating", "profile": "compact_disc", "material": "Al", "coat_ior": 1.55})
+    assert asked[0].settings == asked[1].settings
+
+
 @pytest.mark.slow
 @pytest.mark.parametrize("source", ["compact_disc", "dvd", "recipe.toml"])
 def test_a_disc_opens_under_plastic_with_its_tracks_round_the_centre(source, command, tmp_path, monkeypatch):
