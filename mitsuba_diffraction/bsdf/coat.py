@@ -53,7 +53,7 @@ class Coat:
             )
         self.relative = max(self.index / outside, 1.0)
         self.eta = opaque(self.relative)
-        self.dispersion = None if medium.is_constant else Dispersion(medium, outside)
+        self.dispersion = None if medium.is_constant else Dispersion([medium], outside)
 
     def etas(self, si: mi.SurfaceInteraction3f) -> list[mi.Float]:
         """Return n of each wavelength, relative to the outside."""

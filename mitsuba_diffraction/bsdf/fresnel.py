@@ -150,7 +150,7 @@ class Dielectric(Material):
         self.medium, self.outside, self.coat = medium, outside, coat
         self.eta = mi.Float(medium.nominal.real / outside)
         if not medium.is_constant:
-            self.dispersion = Dispersion(medium, outside)
+            self.dispersion = Dispersion([medium], outside)
         self.update()
 
     def known(self) -> tuple[KnownRange, ...]:

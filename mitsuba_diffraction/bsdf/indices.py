@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import drjit as dr
 import mitsuba as mi
 import numpy as np
@@ -80,28 +82,40 @@ def absolute_index(name: str, index: float | str) -> float:
 
 
 class Dispersion:
-    """n + ik relative to the medium outside, linear between equidistant wavelengths; constant outside of its table."""
+    """n + ik of media relative to the one outside, linear between equidistant wavelengths; constant outside of them."""
 
-    def __init__(self, index: RefractiveIndex, outside: float) -> None:
-        grid = nodes_of(index)
-        values = index(grid * 1e-3) / outside
+    def __init__(self, media: Sequence[RefractiveIndex], outside: float) -> None:
+        grid = nodes_of(*media)
+        values = np.stack([index(grid * 1e-3) for index in media]) / outside
         self.table = PacketTable(np.stack([values.real, values.imag], -1), width=2)
         self.first, self.last = opaque(grid[0]), opaque(len(grid) - 1)
         self.per_nanometre = opaque((len(grid) - 1) / (grid[-1] - grid[0]))
 
-    def __call__(self, wavelength: mi.Float) -> mi.Complex2f:
-        """Return n + ik at wavelengths in vacuum, nm."""
+    def position(self, wavelength: mi.Float) -> tuple[mi.UInt32, mi.Float]:
+        """Return the node below a wavelength in vacuum, nm, and the distance from it in steps."""
         x = limited((wavelength - self.first) * self.per_nanometre, 0, self.last)
         node = dr.minimum(integer_part(x), integer_part(self.last) - 1)
-        low, high = self.table(node), self.table(node + 1)
-        return mi.Complex2f(*dr.lerp(low, high, x - mi.Float(mi.Int32(node))))
+        return node, x - mi.Float(mi.Int32(node))
+
+    def at(self, position: tuple[mi.UInt32, mi.Float], medium: mi.UInt32 | None = None) -> mi.Complex2f:
+        """Return n + ik at a `position`, of the first medium by default."""
+        node, fraction = position
+        if medium is not None:
+            node = medium * (integer_part(self.last) + 1) + node
+        return mi.Complex2f(*dr.lerp(self.table(node), self.table(node + 1), fraction))
+
+    def __call__(self, wavelength: mi.Float) -> mi.Complex2f:
+        """Return n + ik of the first medium at wavelengths in vacuum, nm."""
+        return self.at(self.position(wavelength))
 
 
-def nodes_of(index: RefractiveIndex) -> np.ndarray:
-    """Return equidistant wavelengths of a table and visible light, at most 1 nm apart unless there are too many, nm."""
-    first, last = index.range
-    first, last = (min(VISIBLE[0], np.ceil(first)), max(VISIBLE[1], np.floor(last))) if first else VISIBLE
-    return np.linspace(first, last, min(round(last - first), MAX_INDEX_NODES) + 1)
+def nodes_of(*media: RefractiveIndex) -> np.ndarray:
+    """Return equidistant wavelengths of tables and visible light, at most 1 nm apart unless there are too many, nm."""
+    (first, last), max_nodes = VISIBLE, 10 * MAX_INDEX_NODES // max(10, len(media))
+    for start, end in (index.range for index in media):
+        if start:
+            first, last = min(first, np.ceil(start)), max(last, np.floor(end))
+    return np.linspace(first, last, min(round(last - first), max_nodes) + 1)
 
 
 def known_spectrum(name: str, texture: mi.Texture) -> KnownRange:

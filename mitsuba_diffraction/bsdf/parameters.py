@@ -133,7 +133,9 @@ class Scales:
     """
 
     def __init__(self, props: mi.Properties) -> None:
-        self.height, self._lateral = (VaryingNumber(props, name, 1.0) for name in ("height_scale", "lateral_scale"))
+        self.height, self._lateral = (
+            VaryingNumber(name, props.get(name, 1.0)) for name in ("height_scale", "lateral_scale")
+        )
 
     def __iter__(self) -> Iterator[VaryingNumber]:
         return iter([self.height, self._lateral])

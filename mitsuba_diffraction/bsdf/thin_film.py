@@ -1,8 +1,8 @@
 """Thin films on the relief: zinc sulphide of a hologram, the oxide of anodised titanium, the stack of a beetle.
 
 R and T of a plane under the films follow from the characteristic matrices of `../optics/film_stack.py`, which E and
-samplers use as well (`film_stack.powers`: what changes |r|² or |t|² here changes it there). One film is evaluated
-without a loop. Several films are evaluated by a loop over a table of their indices, whose length is opaque.
+samplers use as well (`film_stack.powers`: what changes |r|² or |t|² here changes it there). Films are evaluated by a
+loop over a table of their indices, whose length is opaque; one film without the loop.
 """
 
 from __future__ import annotations
@@ -10,22 +10,26 @@ from __future__ import annotations
 import re
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeAlias
 
 import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from ..errors import RequestError
+from ..errors import RequestError, is_number
 from ..optics import film_stack
 from ..optics.materials import KnownRange, RefractiveIndex, is_file
-from .device_tables import PacketTable, integer_part, larger, limited, opaque
+from .device_tables import integer_part, larger, opaque
 from .fresnel import Cosines, Material, PerfectMirror
-from .indices import MAX_INDEX_NODES, Dispersion, index_from, nodes_of
+from .indices import Dispersion, index_from
 from .varying import VaryingNumber, number_or_text
 
 MAX_THICKNESS = 4.0  # µm in all: the fringes of thicker films are narrow in λ
 MAX_FILMS = 100
+_Fields: TypeAlias = "list[tuple[mi.Complex2f, mi.Complex2f]]"
+"""(B, C) of s and p at a face of a film."""
+_Face: TypeAlias = "tuple[_Fields, mi.Complex2f]"
+"""These fields, and the product of the factors e^{iδ} of the films below."""
 
 
 @dataclass
@@ -65,12 +69,12 @@ class _Plane:
         square = dr.square(z_0) - dr.square(n_0)
         return cls(n_0, n_s, z_0, _root(n_s * n_s + square, is_real), square)
 
-    def fields(self) -> list[tuple[mi.Complex2f, mi.Complex2f]]:
+    def fields(self) -> _Fields:
         """Return (B, C) of s and p at the medium below."""
         one = mi.Complex2f(1, 0)
         return [(one, self.z_s), (one, self.z_s / (self.n_s * self.n_s))]
 
-    def waves(self, fields: list[tuple[mi.Complex2f, mi.Complex2f]], across: mi.Complex2f) -> list[Wave]:
+    def waves(self, fields: _Fields, across: mi.Complex2f) -> list[Wave]:
         """Return the waves of s and p from (B, C) at the outermost face and the product of the factors e^{iδ}."""
         found = []
         of_s, of_p = (self.z_0, mi.Complex2f(1, 0)), (self.z_0 / dr.square(self.n_0), self.n_0 / self.n_s)
@@ -89,13 +93,13 @@ def _root(square: mi.Complex2f, is_real: bool) -> mi.Complex2f:
 
 
 def _crossed(
-    fields: list[tuple[mi.Complex2f, mi.Complex2f]],
+    fields: _Fields,
     across: mi.Complex2f,
     n: mi.Complex2f,
     thickness: mi.Float,
     square: mi.Float,
     is_real: bool,
-) -> tuple[list[tuple[mi.Complex2f, mi.Complex2f]], mi.Complex2f]:
+) -> _Face:
     """Return (B, C) of s and p at the outer face of a film, and `across` times its factor.
 
     Args:
@@ -133,27 +137,36 @@ def with_film(props: mi.Properties, material: Material) -> Material:
         raise RequestError(f"{given[0]}: got it alone, wanted thin_film_thickness and thin_film_ior together")
     if isinstance(material, PerfectMirror):
         raise RequestError("thin_film_thickness: got a film on material=none, wanted a dielectric or a conductor")
-    iors, thicknesses = props["thin_film_ior"], props["thin_film_thickness"]
+    iors, thickness = props["thin_film_ior"], props["thin_film_thickness"]
     indices = list_entries("thin_film_ior", iors) if isinstance(iors, str) else [iors]
     media = [index_from("thin_film_ior", number_or_text(ior), absorbing=True) for ior in indices]
-    scale = VaryingNumber(props, "thin_film_scale", 1.0)
-    if len(media) == 1 and not (isinstance(thicknesses, str) and _is_list(thicknesses)):
-        return FilmedMaterial(material, media[0], VaryingNumber(props, "thin_film_thickness", 0.0), scale)
-    if not isinstance(thicknesses, str):
-        given_as = "one number" if not isinstance(thicknesses, mi.Object) else "a texture"
+    scale = VaryingNumber("thin_film_scale", props.get("thin_film_scale", 1.0))
+    if len(media) > 1 or (isinstance(thickness, str) and _is_list(thickness)):
+        thickness = _thicknesses(thickness, len(media))
+    return FilmedMaterial(material, media, VaryingNumber("thin_film_thickness", thickness), scale)
+
+
+def _thicknesses(given: Any, count: int) -> list[float]:
+    """Return the thicknesses of several films from the list of a scene.
+
+    Raises:
+        RequestError: if it is no list of as many numbers.
+    """
+    if not isinstance(given, str):
+        given_as = "one number" if not isinstance(given, mi.Object) else "a texture"
         raise RequestError(
-            f"thin_film_thickness: got {given_as} for {len(media)} films, wanted a list of as many numbers; "
+            f"thin_film_thickness: got {given_as} for {count} films, wanted a list of as many numbers; "
             "thin_film_scale is a number or texture by which they are multiplied"
         )
-    numbers = [number_or_text(text) for text in list_entries("thin_film_thickness", thicknesses)]
-    if any(isinstance(number, str) for number in numbers):
-        raise RequestError(f"thin_film_thickness: got {thicknesses!r}, wanted numbers of µm")
-    if len(numbers) != len(media):
+    numbers = [number_or_text(text) for text in list_entries("thin_film_thickness", given)]
+    if bad := [number for number in numbers if not is_number(number)]:
+        raise RequestError(f"thin_film_thickness: got {bad[0]!r}, wanted 0 to {MAX_THICKNESS:g} um")
+    if len(numbers) != count:
         raise RequestError(
-            f"thin_film_thickness: got {len(numbers)} thicknesses for {len(media)} films (thin_film_ior), wanted one "
-            "for each, from the outside in"
+            f"thin_film_thickness: got {len(numbers)} thicknesses for {count} films (thin_film_ior), wanted one for "
+            "each, from the outside in"
         )
-    return StackedMaterial(material, media, [float(number) for number in numbers], scale)
+    return numbers
 
 
 def _is_list(text: str) -> bool:
@@ -200,35 +213,58 @@ def _leading_file(text: str) -> re.Match[str] | None:
     return None
 
 
-class _Filmed(Material):
+class FilmedMaterial(Material):
     """A dielectric or a conductor under films.
 
     Attributes:
         below: the material.
         films: the indices, absolute, from the outside in.
+        thickness: of one film, a number or a texture; of several, as many numbers, µm.
         scale: the factor of the thicknesses.
+        propagates: whether there is one film, in which light from either medium propagates at all angles.
     """
 
-    def __init__(self, below: Material, films: list[RefractiveIndex], scale: VaryingNumber) -> None:
-        self.below, self.films, self.scale = below, films, scale
+    def __init__(
+        self, below: Material, films: list[RefractiveIndex], thickness: VaryingNumber, scale: VaryingNumber
+    ) -> None:
+        self.below, self.films, self.thickness, self.scale = below, films, thickness, scale
         self.outside, self.coat = below.outside, below.coat
         self.transparent, self.dispersion = below.transparent, below.dispersion
+        self.varies, self.count = thickness.varies or scale.varies, opaque(len(films))
+        has_number = len(films) == 1 and films[0].is_constant and not films[0].absorbs
+        self.indices: mi.Float | Dispersion = (
+            opaque(films[0].nominal.real / self.outside) if has_number else Dispersion(films, self.outside)
+        )
+        self.update()
 
     @property
     def eta(self) -> Any:  # type: ignore[override]
         return self.below.eta
 
-    def thicknesses(self) -> tuple[np.ndarray, tuple[float, float]]:
-        """Return the thicknesses of the films in µm, and the bounds of their factor."""
-        raise NotImplementedError
-
     def known(self) -> tuple[KnownRange, ...]:
         return (*self.below.known(), *(film.known("thin_film_ior") for film in self.films))
+
+    def update(self) -> None:
+        self.below.update()
+        for number in (self.thickness, self.scale):
+            number.read()
+            if not number.varies:
+                dr.make_opaque(number.value)
+        self._check()
+        # From each medium of incidence light propagates in a film of higher index.
+        values = self.films[0].values.real / self.outside
+        below = float(np.max(dr.detach(self.below.eta))) if self.transparent else 1.0
+        if self.dispersion is not None:
+            below = float(self.below.stack(below).below.values.real.max()) / self.outside
+        above = 1.0 if self.coat is None else self.coat.medium.values.real.max() / self.outside
+        self.propagates = len(self.films) == 1 and not self.films[0].absorbs and values.min() >= max(above, below)
 
     def _check(self) -> None:
         if (scale := self.scale.values[0]) < 0:
             raise RequestError(f"thin_film_scale: got {scale:.6g}, wanted 0 or more")
         thicknesses, (_, high) = self.thicknesses()
+        if len(thicknesses) != len(self.films):
+            raise RequestError(f"thin_film_thickness: got {len(thicknesses)} thicknesses for {len(self.films)} films")
         if (bad := thicknesses[~(np.isfinite(thicknesses) & (thicknesses >= 0))]).size:
             raise RequestError(f"thin_film_thickness: got {bad[0]:.6g}, wanted 0 to {MAX_THICKNESS:g} um")
         if (total := high * thicknesses.sum()) > MAX_THICKNESS * (1 + 1e-6):
@@ -236,6 +272,16 @@ class _Filmed(Material):
                 f"thin_film_thickness: got {total:.6g}, wanted 0 to {MAX_THICKNESS:g} um; a thicker layer is a coat "
                 "(coat_ior)"
             )
+
+    def thicknesses(self) -> tuple[np.ndarray, tuple[float, float]]:
+        """Return the thicknesses of the films in µm, and the bounds of their factor."""
+        low_scale, high_scale = map(float, self.scale.values[[0, -1]])
+        if not self.thickness.varies:
+            return np.ravel(np.array(dr.detach(self.thickness.value), np.float64)), (low_scale, high_scale)
+        low, high = self.thickness.values[[0, -1]]
+        if low < 0 or high <= 0:
+            return np.array([low]), (1.0, 1.0)
+        return np.array([high]), (float(low / high * low_scale), high_scale)
 
     def stack(self, eta: float) -> film_stack.Stack:
         thicknesses, scales = self.thicknesses()
@@ -246,7 +292,42 @@ class _Filmed(Material):
         self, si: mi.SurfaceInteraction3f, cos: Cosines, active: mi.Bool, with_phase: bool
     ) -> list[tuple[list[Wave], mi.Float]]:
         """Return the waves of each wavelength and Re z_s/z_0; without their phase, total reflection has a real z_s."""
-        raise NotImplementedError
+        cosines, above, scale = mi.UnpolarizedSpectrum(cos), self.above(si), self.scale.at(si, active)
+        is_real, indices = self.propagates and self.transparent and not with_phase, self.indices
+        planes = [
+            _Plane.of(dr.abs(cosine), *self._media(cosine, n_s), is_real)
+            for cosine, n_s in zip(cosines, self.below.index(si, active), strict=True)
+        ]
+        positions = [indices.position(w) for w in si.wavelengths] if isinstance(indices, Dispersion) else []
+
+        def crossed(thickness: mi.Float, faces: list[_Face], film: mi.UInt32 | None = None) -> list[_Face]:
+            found = []
+            for channel, (plane, face) in enumerate(zip(planes, faces, strict=True)):
+                n = indices.at(positions[channel], film) if positions else mi.Complex2f(indices, 0)
+                depth = thickness / si.wavelengths[channel]
+                if self.coat is not None:
+                    n, depth = n / above[channel], depth * above[channel]
+                found.append(_crossed(*face, n, depth, plane.square, self.propagates))
+            return found
+
+        films, from_below, nanometres = integer_part(self.count), cosines[0] < 0, self.outside * 1e3
+
+        def body(step: mi.UInt32, faces: list[_Face]) -> tuple[mi.UInt32, list[_Face]]:
+            # From the innermost film outwards; for light from below, from the outermost inwards.
+            film = dr.select(from_below, step, films - 1 - step) if self.transparent else films - 1 - step
+            thickness = scale * nanometres * dr.gather(mi.Float, self.thickness.value, film, active)
+            return step + 1, crossed(thickness, faces, film)
+
+        faces = [(plane.fields(), mi.Complex2f(1, 0)) for plane in planes]
+        if len(self.films) == 1:
+            faces = crossed(self.thickness.at(si, active) * scale * nanometres, faces)
+        elif dr.grad_enabled(self.thickness.value, scale, planes):
+            # Dr.Jit cannot differentiate the loop in reverse mode.
+            for step in range(len(self.films)):
+                _, faces = body(mi.UInt32(step), faces)
+        else:
+            _, faces = dr.while_loop((mi.UInt32(0), faces), lambda step, _: step < films, body)
+        return [(plane.waves(*face), plane.z_s.real / plane.z_0) for plane, face in zip(planes, faces, strict=True)]
 
     def _media(self, cos: mi.Float, n_s: mi.Complex2f) -> tuple[mi.Float, mi.Complex2f]:
         """Return n_0 and n_s, exchanged for light from below."""
@@ -282,151 +363,9 @@ class _Filmed(Material):
     def traverse(self, callback: mi.TraversalCallback) -> None:
         self.below.traverse(callback)
         self.scale.put(callback)
-
-
-class FilmedMaterial(_Filmed):
-    """A dielectric or a conductor under one thin film, whose thickness may be a texture."""
-
-    def __init__(self, below: Material, film: RefractiveIndex, thickness: VaryingNumber, scale: VaryingNumber) -> None:
-        super().__init__(below, [film], scale)
-        self.thickness, self.varies = thickness, thickness.varies or scale.varies
-        self.film: mi.Float | Dispersion = (
-            opaque(film.nominal.real / self.outside)
-            if film.is_constant and not film.absorbs
-            else Dispersion(film, self.outside)
-        )
-        self.update()
-
-    def update(self) -> None:
-        self.below.update()
-        for number in (self.thickness, self.scale):
-            number.read()
-            if not number.varies:
-                dr.make_opaque(number.value)
-        self._check()
-        # From each medium of incidence light propagates in a film of higher index.
-        values = self.films[0].values.real / self.outside
-        below = float(np.max(dr.detach(self.below.eta))) if self.transparent else 1.0
-        if self.dispersion is not None:
-            below = float(self.below.stack(below).below.values.real.max()) / self.outside
-        above = 1.0 if self.coat is None else self.coat.medium.values.real.max() / self.outside
-        self.propagates = not self.films[0].absorbs and values.min() >= max(above, below)
-
-    def thicknesses(self) -> tuple[np.ndarray, tuple[float, float]]:
-        low, high = self.thickness.values[[0, -1]]
-        low_scale, high_scale = self.scale.values[[0, -1]]
-        if low < 0 or high <= 0:
-            return np.array([low]), (1.0, 1.0)
-        return np.array([high]), (float(low / high * low_scale), float(high_scale))
-
-    def _waves(
-        self, si: mi.SurfaceInteraction3f, cos: Cosines, active: mi.Bool, with_phase: bool
-    ) -> list[tuple[list[Wave], mi.Float]]:
-        thickness = self.thickness.at(si, active) * self.scale.at(si, active) * (self.outside * 1e3)
-        real, found = self.propagates and self.transparent and not with_phase, []
-        of_each = zip(si.wavelengths, mi.UnpolarizedSpectrum(cos), self.below.index(si, active), strict=True)
-        for (wavelength, cosine, n_s), above in zip(of_each, self.above(si), strict=True):
-            n = self.film(wavelength) if isinstance(self.film, Dispersion) else mi.Complex2f(self.film, 0)
-            plane = _Plane.of(dr.abs(cosine), *self._media(cosine, n_s), real)
-            depth = thickness / wavelength
-            if self.coat is not None:
-                n, depth = n / above, depth * above
-            fields, across = _crossed(plane.fields(), mi.Complex2f(1, 0), n, depth, plane.square, self.propagates)
-            found.append((plane.waves(fields, across), plane.z_s.real / plane.z_0))
-        return found
-
-    def traverse(self, callback: mi.TraversalCallback) -> None:
-        super().traverse(callback)
         self.thickness.put(callback)
 
     def __repr__(self) -> str:
-        return f"{self.below}, under {self.thickness} um of {self.films[0]}"
-
-
-class StackedMaterial(_Filmed):
-    """A dielectric or a conductor under several thin films."""
-
-    def __init__(
-        self, below: Material, films: list[RefractiveIndex], thicknesses: list[float], scale: VaryingNumber
-    ) -> None:
-        super().__init__(below, films, scale)
-        self.thickness, self.varies, self.count = mi.Float(thicknesses), scale.varies, opaque(len(films))
-        first, last = nodes_of(films[0])[[0, -1]] if not self.films[0].is_constant else (360.0, 830.0)
-        for film in films:
-            if not film.is_constant:
-                own = nodes_of(film)
-                first, last = min(first, own[0]), max(last, own[-1])
-        max_nodes = 10 * MAX_INDEX_NODES // max(10, len(films))
-        grid = np.linspace(first, last, min(round(last - first), max_nodes) + 1)
-        values = np.stack([film(grid * 1e-3) for film in films]) / self.outside
-        self.table, self.nodes = PacketTable(np.stack([values.real, values.imag], -1), width=2), opaque(len(grid))
-        self.first, self.per_nanometre = opaque(grid[0]), opaque((len(grid) - 1) / (grid[-1] - grid[0]))
-        self.update()
-
-    def update(self) -> None:
-        self.below.update()
-        self.scale.read()
-        if not self.scale.varies:
-            dr.make_opaque(self.scale.value)
-        if dr.width(self.thickness) != len(self.films):
-            raise RequestError(
-                f"thin_film_thickness: got {dr.width(self.thickness)} thicknesses for {len(self.films)} films"
-            )
-        dr.make_opaque(self.thickness)
-        self._check()
-
-    def thicknesses(self) -> tuple[np.ndarray, tuple[float, float]]:
-        low, high = self.scale.values[[0, -1]]
-        return np.array(dr.detach(self.thickness), np.float64), (float(low), float(high))
-
-    def _waves(
-        self, si: mi.SurfaceInteraction3f, cos: Cosines, active: mi.Bool, with_phase: bool
-    ) -> list[tuple[list[Wave], mi.Float]]:
-        scale, nodes = self.scale.at(si, active) * (self.outside * 1e3), integer_part(self.nodes)
-        planes, starts, fractions, state = [], [], [], []
-        cosines, aboves = mi.UnpolarizedSpectrum(cos), self.above(si)
-        for wavelength, cosine, n_s in zip(si.wavelengths, cosines, self.below.index(si, active), strict=True):
-            planes.append(_Plane.of(dr.abs(cosine), *self._media(cosine, n_s), False))
-            x = limited((wavelength - self.first) * self.per_nanometre, 0, self.nodes - 1)
-            node = dr.minimum(integer_part(x), nodes - 2)
-            starts.append(node)
-            fractions.append(x - mi.Float(mi.Int32(node)))
-            (b, c), (d, e) = planes[-1].fields()
-            state += [b, c, d, e, mi.Complex2f(1, 0)]
-        films, from_below = integer_part(self.count), cosines[0] < 0
-
-        def body(step: mi.UInt32, *state: mi.Complex2f) -> tuple[Any, ...]:
-            # From the innermost film outwards; for light from below, from the outermost inwards.
-            film = dr.select(from_below, step, films - 1 - step) if self.transparent else films - 1 - step
-            thickness, following = scale * dr.gather(mi.Float, self.thickness, film, active), []
-            for channel, (plane, node, fraction) in enumerate(zip(planes, starts, fractions, strict=True)):
-                b, c, d, e, across = state[5 * channel : 5 * channel + 5]
-                at = film * nodes + node
-                n = mi.Complex2f(*dr.lerp(self.table(at, active), self.table(at + 1, active), fraction))
-                depth = thickness / si.wavelengths[channel]
-                if self.coat is not None:
-                    n, depth = n / aboves[channel], depth * aboves[channel]
-                (first, second), across = _crossed([(b, c), (d, e)], across, n, depth, plane.square, False)
-                following += [*first, *second, across]
-            return step + 1, *following
-
-        if dr.grad_enabled(self.thickness, scale, *planes):
-            # Dr.Jit cannot differentiate the loop in reverse mode.
-            for step in range(len(self.films)):
-                _, *state = body(mi.UInt32(step), *state)
-        else:
-            _, *state = dr.while_loop((mi.UInt32(0), *state), lambda step, *_: step < films, body)
-        found = []
-        for channel, plane in enumerate(planes):
-            b, c, d, e, across = state[5 * channel : 5 * channel + 5]
-            found.append((plane.waves([(b, c), (d, e)], across), plane.z_s.real / plane.z_0))
-        return found
-
-    def traverse(self, callback: mi.TraversalCallback) -> None:
-        super().traverse(callback)
-        callback.put("thin_film_thickness", self.thickness, mi.ParamFlags.Differentiable)
-
-    def __repr__(self) -> str:
-        thicknesses, _ = self.thicknesses()
-        films = ", ".join(f"{d:.4g} um of {n}" for n, d in zip(self.films, thicknesses, strict=True))
+        thicknesses = [self.thickness] if self.thickness.varies else [f"{d:.4g}" for d in self.thicknesses()[0]]
+        films = ", ".join(f"{d} um of {n}" for n, d in zip(self.films, thicknesses, strict=True))
         return f"{self.below}, under {films}"

@@ -17,20 +17,20 @@ class VaryingNumber:
 
     Attributes:
         name: of the parameter.
-        value: a number, or a texture of numbers, which may be given by the name of its file.
+        value: a number, several of them, or a texture of numbers, which may be given by the name of its file.
         values: the distinct values of a texture, ascending; interpolated ones lie between them.
     """
 
-    def __init__(self, props: mi.Properties, name: str, default: float) -> None:
-        """Read the parameter `name`.
+    def __init__(self, name: str, value: Any) -> None:
+        """Take the value of the parameter `name`; a list has several numbers.
 
         Raises:
             RequestError: if it is neither a number nor a texture whose values are known.
         """
-        self.name, value = name, props.get(name, default)
+        self.name = name
         if isinstance(value := number_or_text(value), str):
             value = numbers_from(name, value)
-        if not is_number(value) and not isinstance(value, mi.Texture):
+        if not is_number(value) and not isinstance(value, mi.Texture | list):
             raise RequestError(f"{name}: got {value!r}, wanted a number or a texture")
         self.value = value if isinstance(value, mi.Texture) else mi.Float(value)
         self.read()

@@ -212,7 +212,7 @@ def test_thicknesses_are_updated_and_have_derivatives(llvm):
         ({"thin_film_ior": "2 x (2, 3", "thin_film_thickness": "0.1"}, "wanted a list such as '2.35, 1.38'"),
         ({"thin_film_ior": "2,, 3", "thin_film_thickness": "0.1"}, "wanted a list"),
         ({"thin_film_ior": "99 x (2, 3)", "thin_film_thickness": "0.1"}, "wanted a list of 1 to 100"),
-        ({"thin_film_ior": "2, 3", "thin_film_thickness": "0.1, thick"}, "wanted numbers of µm"),
+        ({"thin_film_ior": "2, 3", "thin_film_thickness": "0.1, thick"}, "got 'thick', wanted 0 to 4 um"),
         ({"thin_film_ior": "2, 3", "thin_film_thickness": "3, 2"}, "got 5, wanted 0 to 4 um"),
         ({"thin_film_ior": "2, 3", "thin_film_thickness": "0.1, -0.2"}, "got -0.2, wanted 0 to 4 um"),
         ({"thin_film_ior": "2, zinc", "thin_film_thickness": "0.1, 0.2"}, "thin_film_ior: got 'zinc'"),
