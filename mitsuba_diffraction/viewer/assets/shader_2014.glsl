@@ -1,4 +1,4 @@
-// The shader of 2014 (evaluation/realtime_shader of the package): colour of a tile by Taylor textures, wavelength by
+// The shader of 2014 (shader_2014 of the package): colour of a tile by Taylor textures, wavelength by
 // wavelength. VARIANT is that of VARIANTS in shader_2014.js; a quirk is a departure of the published code that can be
 // switched off.
 #define OF_ORDERS (VARIANT == 1 || VARIANT == 4)
