@@ -59,7 +59,7 @@ class ExportedGrating:
         theory: "scalar" or "rigorous".
         material: a conductor by Mitsuba's name or a file; "none" is the perfect mirror, in scalar theory.
         int_ior: or the index of a dielectric, a number, a name or a file.
-        shortest: µm, the shortest wavelength that is asked for.
+        shortest: µm, the shortest wavelength that is requested.
 
     Raises:
         ValueError: if the material or the theory is wrong, or more than 1000 orders propagate.
@@ -126,9 +126,13 @@ class ExportedGrating:
 
     @cached_property
     def _solver(self) -> OrderSolver:
-        largest = 1.0 if self.int_ior is None else max(1.0, index_of("int_ior", self.int_ior).values.real.max())
-        # The largest |q| is 2n/λ, of light reflected inside.
-        return order_solver(self.theory, self.height_field, self.shortest / largest)
+        shortest = self.shortest
+        if self.int_ior is not None and self.transmits:
+            # The maximum of |q| is 2n/λ, of light reflected inside; linear in n, n/λ has it at a node.
+            index = index_of("int_ior", self.int_ior)
+            at = np.append(index.wavelengths[index.wavelengths > shortest], shortest)
+            shortest = float(np.min(at / np.maximum(index(at).real, 1)))
+        return order_solver(self.theory, self.height_field, shortest)
 
     def diffracted(self, light: IncidentLight) -> Iterator[DiffractedSide]:
         """Yield the reflected and, of a dielectric, the transmitted orders of light.

@@ -13,7 +13,7 @@ from numpy.typing import ArrayLike, NDArray
 from ..errors import RequestError, is_number
 from ..files.outputs import MARK, METADATA
 from ..files.writing import whole_file
-from ..optics.materials import RefractiveIndex, index_of
+from ..optics.materials import index_of
 from ..progress import Progress, silent
 from ..rigorous.coordinate_transformation import is_profile
 from ..settings import THEORIES, TRANSMISSIONS
@@ -236,9 +236,9 @@ def efficiencies(
         raise RequestError(f"transmission: got {transmission!r} with {absorbing}, wanted a dielectric: int_ior, real")
     if profile := is_profile(height_field):
         height_field = HeightField(height_field.heights[:1], height_field.pixel_size, height_field.source)
-    # The largest |q| is (n_i + n_o)/λ.
-    shortest = wavelengths.min() * 1e-3 * (1.0 if transmission == "none" else 2 / (1 + max(_largest(medium), 1)))
-    solver = order_solver(theory, height_field, shortest)
+    n = 1.0 if transmission == "none" or medium is None else np.maximum(medium(wavelengths * 1e-3).real, 1)
+    # The maximum of |q| is (n_i + n_o)/λ.
+    solver = order_solver(theory, height_field, 1e-3 * float(np.min(2 * wavelengths / (1 + n))))
     solve = {"none": solver.reflected, "interface": solver.transmitted, "sheet": solver.through_sheet}[transmission]
     found: dict[tuple[int, ...], Array] = {}
     for step, (a, w) in enumerate(np.ndindex(len(angles), len(wavelengths)), 1):
@@ -257,10 +257,6 @@ def efficiencies(
         wavelengths,
         description(height_field.source, material, int_ior, azimuth, theory, transmission),
     )
-
-
-def _largest(medium: RefractiveIndex | None) -> float:
-    return 1.0 if medium is None else float(medium.values.real.max())
 
 
 def description(

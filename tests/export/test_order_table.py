@@ -198,3 +198,12 @@ def test_a_wrong_command_is_one_line(command, line, message, tmp_path, monkeypat
     assert message in error
     assert error.splitlines()[-1].startswith("mitsuba-diffraction: error:")
     assert not list(tmp_path.iterdir())
+
+
+def test_the_far_infrared_of_a_table_adds_no_orders(tmp_path):
+    (tmp_path / "glass.csv").write_text("wl,n\n0.3,1.5\n1.1,1.5\n10,30\n")
+    tile = md.gratings.crossed(2.0, 0.1, samples=24)
+    indices = str(tmp_path / "glass.csv"), 1.5
+    found, wanted = (table(tmp_path / "a.csv", tile, 600, 20, theory="scalar", int_ior=index) for index in indices)
+    assert [list(row.values())[:7] for row in found] == [list(row.values())[:7] for row in wanted]
+    np.testing.assert_allclose(*([row["efficiency"] for row in rows] for rows in (found, wanted)), atol=1e-8)

@@ -22,6 +22,17 @@ def test_a_flat_surface_reflects_by_fresnels_formulas(theory):
     np.testing.assert_allclose(found.values.sum(axis=0), found.order(0), atol=1e-9)
 
 
+def test_the_far_infrared_of_a_table_adds_no_orders(tmp_path):
+    (tmp_path / "glass.csv").write_text("wl,n\n0.3,1.5\n1.1,1.5\n10,30\n")
+    tile = md.gratings.crossed(2.0, 0.1, samples=24)
+    found, wanted = (
+        md.efficiencies(tile, 20, 600, int_ior=index, transmission="interface")
+        for index in (str(tmp_path / "glass.csv"), 1.5)
+    )
+    np.testing.assert_array_equal(found.orders, wanted.orders)
+    np.testing.assert_allclose(found.values, wanted.values, atol=1e-9)
+
+
 @pytest.mark.parametrize("azimuth", [0, 37])
 @pytest.mark.parametrize("theory", ["scalar", "rigorous"])
 def test_a_flat_film_transmits_by_fresnels_formulas(theory, azimuth):
