@@ -323,7 +323,7 @@ class Grating:
         return through_layer(split, mi.UnpolarizedSpectrum(etas), directions, inside, has_face, ctx.mode)
 
     def _covered(self, si: mi.SurfaceInteraction3f) -> tuple[list[mi.Bool], mi.SurfaceInteraction3f]:
-        """Return which of the wavelengths the spectrum and the material cover, and the point with covered ones only.
+        """Return which of the wavelengths the spectrum and all indices cover, and the point with covered ones only.
 
         At wavelengths that are not covered the grating is black, and the index of a metal may be NaN: they are replaced
         by the shortest covered wavelength.

@@ -44,7 +44,7 @@ def write_order_table(
 ) -> int:
     """Write a row for each wavelength, direction of light, order and polarisation; return their number.
 
-    The first lines, which begin with #, tell the surface, units and conventions.
+    The first lines, which begin with #, state the surface, units and conventions.
 
     Args:
         grating: the surface.

@@ -151,14 +151,14 @@ class Candidates:
         self, bsdf: mi.BSDF, si: mi.SurfaceInteraction3f, numbers: tuple, active: mi.Bool
     ) -> tuple[mi.Vector3f, mi.Float]:
         u, step, shift, chosen, pick = numbers
-        ctx, tells_failure = mi.BSDFContext(), _tells_failure(bsdf)
+        ctx, marks_failure = mi.BSDFContext(), _marks_failure(bsdf)
         omega, guess, sum_of_guesses = mi.Vector3f(0, 0, 1), mi.Float(0), mi.Float(0)
         candidate = mi.UInt32(0)
         while candidate < self._count:
             position = dr.minimum(dr.fma(mi.Float(candidate), step, u), BELOW_ONE)
             bs, _ = bsdf.sample(ctx, si, position, _lattice_point(position / step, shift), active)
             usable = active & ~mi.has_flag(bs.sampled_type, mi.BSDFFlags.Delta)
-            usable &= (bs.wo.z != 0) if dr.hint(tells_failure, mode="scalar") else (bs.pdf > 0)
+            usable &= (bs.wo.z != 0) if dr.hint(marks_failure, mode="scalar") else (bs.pdf > 0)
             h = dr.select(usable, self.light(si.p, si.to_world(bs.wo), usable), 0)
             sum_of_guesses += h
             # A single random number serves all decisions: given one of them, it is uniform after division.
@@ -172,15 +172,15 @@ class Candidates:
         return omega, dr.select(guess > 0, guess / sum_of_guesses, 0)
 
 
-def _tells_failure(bsdf: mi.BSDF) -> bool:
-    """Return whether `sample` of a BSDF returns a direction in the surface where it fails, so that `pdf` need not tell.
+def _marks_failure(bsdf: mi.BSDF) -> bool:
+    """Return whether `sample` of a BSDF returns a direction in the surface where it fails, and `pdf` is not needed.
 
     So do gratings, and BSDFs of Mitsuba that perturb or flip the frame.
     """
     nested = parts(bsdf, mi.BSDF)
     if is_grating(bsdf):
         return True
-    return bsdf.class_name() in ("TwoSidedBRDF", "NormalMap", "BumpMap") and all(map(_tells_failure, nested))
+    return bsdf.class_name() in ("TwoSidedBRDF", "NormalMap", "BumpMap") and all(map(_marks_failure, nested))
 
 
 def _lattice_point(number: mi.Float, shift: mi.Point2f) -> mi.Point2f:

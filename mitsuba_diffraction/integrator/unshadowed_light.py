@@ -202,7 +202,7 @@ def _environment_map(environment: mi.Emitter) -> mi.Float:
 
 
 def _folded_out(cells: NDArray[np.float32]) -> NDArray[np.float32]:
-    """Return the map with the neighbours beyond its edges, which are cells of the same edge."""
+    """Return the map with the neighbours outside of its edges, which are cells of the same edge."""
     padded = np.pad(cells, 1)
     for edge, inner in (((0, slice(1, -1)), cells[0]), ((-1, slice(1, -1)), cells[-1])):
         padded[edge] = inner[::-1]

@@ -23,7 +23,7 @@ from ..settings import VISIBLE
 
 MIN_INDEX, MAX_INDEX = 0.01, 100.0
 MAX_CLEAR_K = 1e-4  # of a transparent medium; glass of 0.1 mm with this k absorbs a fifth of green light
-_ASKED = 0.3, 1.1  # µm: what cannot be is refused there; elsewhere the range ends at it, as at the pole of a formula
+_STRICT = 0.3, 1.1  # µm: what cannot be is refused there; elsewhere the range ends at it, as at the pole of a formula
 _MAX_FAR = 1e5  # of n and k elsewhere: metals have a thousand in the far infrared
 _MAX_NOISE = 5e-3  # of k, by which measured curves fall below 0
 _MAX_SPREAD = 0.05  # of n or k, relative, in rows of one wavelength
@@ -417,20 +417,20 @@ def _where_known(of_n: _Table, of_k: _Table | None) -> tuple[_Table, _Table, _Ta
 
 
 def _possible_rows(wavelengths: _Table, n: _Table, k: _Table) -> tuple[int, int]:
-    """Return (first, end) of the rows whose n and k can be; those in `_ASKED` all are.
+    """Return (first, end) of the rows whose n and k can be; those in `_STRICT` all are.
 
     Raises:
         RequestError: if one of these cannot be, or, without one there, any row.
     """
-    asked = (wavelengths >= _ASKED[0]) & (wavelengths <= _ASKED[1])
-    limit = np.where(asked, MAX_INDEX, _MAX_FAR)
-    asked |= not asked.any()
+    strict = (wavelengths >= _STRICT[0]) & (wavelengths <= _STRICT[1])
+    limit = np.where(strict, MAX_INDEX, _MAX_FAR)
+    strict |= not strict.any()
     of_both = [("n", n, (n >= MIN_INDEX) & (n <= limit)), ("k", k, (k >= -_MAX_NOISE) & (k <= limit))]
     for what, values, can_be in of_both:
-        if (bad := np.flatnonzero(asked & ~can_be)).size:
+        if (bad := np.flatnonzero(strict & ~can_be)).size:
             low = MIN_INDEX if what == "n" else 0.0
             raise RequestError(f"got {what} = {values[bad[0]]:g}, wanted {what} from {low:g} to {limit[bad[0]]:g}")
-    wrong, rows = np.flatnonzero(~(of_both[0][2] & of_both[1][2])), np.flatnonzero(asked)
+    wrong, rows = np.flatnonzero(~(of_both[0][2] & of_both[1][2])), np.flatnonzero(strict)
     before, after = wrong[wrong < rows[0]], wrong[wrong > rows[-1]]
     return int(before[-1]) + 1 if before.size else 0, int(after[0]) if after.size else len(n)
 
