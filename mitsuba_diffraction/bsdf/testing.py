@@ -7,20 +7,19 @@ import mitsuba as mi
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from ..array_types import Real
 from ..errors import RequestError
 from ..variants import is_supported
 from .device_tables import aligned
 
-Array = NDArray[np.float64]
 
-
-def direction(theta: ArrayLike, phi: ArrayLike = 0.0) -> Array:
+def direction(theta: ArrayLike, phi: ArrayLike = 0.0) -> Real:
     """Return unit vectors (..., 3) at θ from the normal and φ from the x axis, in degrees; the two broadcast."""
     theta, phi = np.deg2rad(theta), np.deg2rad(phi)
     return np.stack([np.sin(theta) * np.cos(phi), np.sin(theta) * np.sin(phi), np.cos(theta) + 0 * phi], axis=-1)
 
 
-def towards(wi: Array, q: ArrayLike, wavelength: ArrayLike) -> Array:
+def towards(wi: Real, q: ArrayLike, wavelength: ArrayLike) -> Real:
     """Return ω_o = (−λq − ω_i,t, z), (..., 3), of ω_i (..., 3), q (..., 2) in cycles/µm and wavelengths (...) in nm.
 
     All three broadcast; z is NaN where the frequency is evanescent.
@@ -79,7 +78,7 @@ def evaluate_pdf(
     wavelengths: ArrayLike,
     context: mi.BSDFContext | None = None,
     uv: ArrayLike = (0.0, 0.0),
-) -> tuple[Array, Array]:
+) -> tuple[Real, Real]:
     """Evaluate f cos θ_o and the density of the BSDF's samples; leading dimensions broadcast.
 
     As many wavelengths are evaluated at once as a ray has (four); the last group is filled up by repetition.
@@ -123,7 +122,7 @@ def evaluate_pdf(
     return value, np.broadcast_to(pdf, len(wo)).reshape(*shape, len(groups))
 
 
-def evaluate(bsdf: mi.BSDF, wi: ArrayLike, wo: ArrayLike, wavelengths: ArrayLike) -> Array:
+def evaluate(bsdf: mi.BSDF, wi: ArrayLike, wo: ArrayLike, wavelengths: ArrayLike) -> Real:
     """Evaluate f cos θ_o in 1/sr, (..., c); arguments and errors of `evaluate_pdf`."""
     return evaluate_pdf(bsdf, wi, wo, wavelengths)[0]
 
@@ -135,7 +134,7 @@ def sample(
     seed: int = 1,
     context: mi.BSDFContext | None = None,
     uv: ArrayLike = (0.0, 0.0),
-) -> tuple[Array, Array, mi.BSDFSample3f]:
+) -> tuple[Real, Real, mi.BSDFSample3f]:
     """Sample a BSDF.
 
     Args:
@@ -168,7 +167,7 @@ def _channels() -> int:
     return len(mi.UnpolarizedSpectrum(0))
 
 
-def _spectrum(value: mi.Spectrum, count: int) -> Array:
+def _spectrum(value: mi.Spectrum, count: int) -> Real:
     """Convert a spectrum of Mitsuba, or the first element of a Mueller matrix: (count, c)."""
     found = array(mi.unpolarized_spectrum(value), np.float64).reshape(_channels(), -1)
     return np.broadcast_to(found, (len(found), count)).T

@@ -37,12 +37,12 @@ import numpy as np
 from numpy.polynomial.legendre import leggauss
 from numpy.typing import ArrayLike, NDArray
 
+from ..array_types import Real
 from ..optics.film_stack import Plane, Stack
 from ..optics.geometry import AnyArray, fresnel, horizon_gain, k_g
 from ..spectrum.grids import OrderGrid
 from ..spectrum.power_spectrum import PowerSpectrum
 
-Real = NDArray[np.float64]
 Indices = NDArray[np.int64]
 
 MAX_E = 1.05

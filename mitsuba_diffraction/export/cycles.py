@@ -14,8 +14,9 @@ from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
+from ..array_types import Real
 from ..files.outputs import MARK
 from ..files.writing import whole_file
 from ..inspection.efficiency import description
@@ -26,8 +27,6 @@ from ..precomputation.grating_spectrum import GratingSpectrum
 from ..precomputation.recipe import Recipe
 from ..settings import VISIBLE, wavelengths_inside
 from ..spectrum.grids import OrderGrid
-
-Array = NDArray[np.float64]
 
 SHORTEST_DRAWN, LONGEST_DRAWN = 390.0, 720.0  # nm, outside of which a display needs next to nothing
 _BINS = 48  # of wavelengths
@@ -70,7 +69,7 @@ def write_shader(
     index = np.array([index_at(w, material, int_ior) for w in (edges[1:] + edges[:-1]) / 2])
     index = np.where(np.isinf(index), 0, index)
     max_kappa = min(_MAX_HEIGHT_SCALE * 4e3 * np.pi / SHORTEST_DRAWN, spectrum.max_kappa)
-    arrays: dict[str, tuple[str, Array]] = {
+    arrays: dict[str, tuple[str, Real]] = {
         "Edges": ("float", edges),
         "Colours": ("color", colours),
         "Eta": ("float", index.real),
@@ -124,7 +123,7 @@ def _parameter(name: str, kind: str, values: ArrayLike) -> str:
     return f"    {kind} {name}[{len(flat)}] = {{\n        " + ",\n        ".join(lines) + "\n    },"
 
 
-def _wavelength_bins() -> tuple[Array, Array]:
+def _wavelength_bins() -> tuple[Real, Real]:
     """Return the edges of bins of equal probability, µm, (n + 1,), and the linear sRGB of their light, (n, 3).
 
     The probability is that of what a display needs, the mean of |r|, |g| and |b|; half of it is the luminance. The mean
@@ -143,10 +142,10 @@ def _wavelength_bins() -> tuple[Array, Array]:
     return edges * 1e-3, _BINS * np.diff(at_edges, axis=0)
 
 
-def _sliced(spectrum: GratingSpectrum, max_kappa: float, of_nodes: Callable[[Array], Array], error: float) -> Array:
+def _sliced(spectrum: GratingSpectrum, max_kappa: float, of_nodes: Callable[[Real], Real], error: float) -> Real:
     """Return powers at equally spaced κ from 0 to `max_kappa`, (n, K), which are linear between them up to `error`."""
 
-    def at(count: int) -> Array:
+    def at(count: int) -> Real:
         return np.stack(
             [of_nodes(np.maximum(spectrum.powers(k), 0)) for k in np.linspace(0, max_kappa, count)], axis=-1
         )
@@ -159,7 +158,7 @@ def _sliced(spectrum: GratingSpectrum, max_kappa: float, of_nodes: Callable[[Arr
     return fine[:, ::2]
 
 
-def _cells(spectrum: GratingSpectrum, max_kappa: float) -> tuple[Array, Array, Callable[[Array], Array]]:
+def _cells(spectrum: GratingSpectrum, max_kappa: float) -> tuple[Real, Real, Callable[[Real], Real]]:
     """Return edges of rows and columns of cells of equal mean power, and the powers of cells from those of nodes.
 
     The edges of the rows are (n + 1,), those of the columns in each (n, k + 1), in cycles/µm. Powers are multiplied by
@@ -171,7 +170,7 @@ def _cells(spectrum: GratingSpectrum, max_kappa: float) -> tuple[Array, Array, C
     rows, of_rows = _equal_parts(q_y, mean.sum(axis=1), _ROWS)
     pairs = [_equal_parts(q_x, weights @ mean, _COLUMNS) for weights in of_rows]
 
-    def of_cells(powers: Array) -> Array:
+    def of_cells(powers: Real) -> Real:
         strips = of_rows @ powers
         return (
             _ROWS
@@ -182,7 +181,7 @@ def _cells(spectrum: GratingSpectrum, max_kappa: float) -> tuple[Array, Array, C
     return rows, np.stack([columns for columns, _ in pairs]), of_cells
 
 
-def _equal_parts(nodes: Array, power: Array, count: int) -> tuple[Array, Array]:
+def _equal_parts(nodes: Real, power: Real, count: int) -> tuple[Real, Real]:
     """Return edges of parts of equal power, (n + 1,), and the fraction of each node in each part, (n, nodes).
 
     The power of a node is spread evenly up to half way to its neighbours. The outermost edges leave out a tenth of
@@ -197,7 +196,7 @@ def _equal_parts(nodes: Array, power: Array, count: int) -> tuple[Array, Array]:
     return edges, np.maximum(inside, 0) / step
 
 
-def _albedo(rows: Array, columns: Array, powers: Array, max_kappa: float, edges: Array) -> Array:
+def _albedo(rows: Real, columns: Real, powers: Real, max_kappa: float, edges: Real) -> Real:
     """Return what a perfect mirror would reflect, by wavelength, azimuth of ω_o and cos θ_o."""
     q = np.stack(
         [

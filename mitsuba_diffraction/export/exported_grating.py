@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from ..array_types import Complex, Real
 from ..errors import RequestError
 from ..inspection.efficiency import checked_numbers, description
 from ..inspection.order_solver import IncidentLight, OrderSolver, index_at, order_solver
@@ -19,9 +20,6 @@ from ..precomputation.recipe import Recipe
 from ..rigorous.coordinate_transformation import is_profile
 from ..settings import THEORIES
 from ..surface.heightfield import HeightField
-
-Array = NDArray[np.float64]
-Complex = NDArray[np.complex128]
 
 _ALONG_NORMAL = 1e-9  # degrees: light along the normal keeps a plane of incidence, and with it s and p
 
@@ -40,7 +38,7 @@ class DiffractedSide:
 
     side: str
     orders: Orders
-    directions: Array
+    directions: Real
     amplitudes: Complex | None
 
     @property
@@ -166,7 +164,7 @@ def material_of(chosen: Mapping[str, Any], parameters: Mapping[str, Any]) -> tup
     return material, int_ior
 
 
-def checked_ranges(wavelengths: ArrayLike, angles: ArrayLike, azimuths: ArrayLike) -> tuple[Array, Array, Array]:
+def checked_ranges(wavelengths: ArrayLike, angles: ArrayLike, azimuths: ArrayLike) -> tuple[Real, Real, Real]:
     """Return wavelengths in nm, (w,), angles, (a,), and azimuths, (b,), if they are in range.
 
     Raises:

@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from ..array_types import Real
 from ..errors import RequestError, is_number
 from ..files.outputs import MARK, METADATA
 from ..files.writing import whole_file
@@ -23,7 +24,6 @@ from .order_solver import IncidentLight, index_at, order_solver
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
-Array = NDArray[np.float64]
 
 POLARISATIONS = ("s", "p")
 _MAX_ROWS, _MAX_COLUMNS = 24, 8  # of a printed table
@@ -44,10 +44,10 @@ class OrderEfficiencies:
         source: description of the surface, material and theory.
     """
 
-    values: Array
+    values: Real
     orders: NDArray[np.int64] | NDArray[np.str_]
-    angles: Array
-    wavelengths: Array
+    angles: Real
+    wavelengths: Real
     source: str
 
     @property
@@ -61,11 +61,11 @@ class OrderEfficiencies:
         }
 
     @property
-    def unpolarised(self) -> Array:
+    def unpolarised(self) -> Real:
         """Return the mean of both polarisations, (order, angle, wavelength)."""
         return self.values.mean(axis=-1)
 
-    def order(self, *m: int | str) -> Array:
+    def order(self, *m: int | str) -> Real:
         """Return the efficiencies of one order, (angle, wavelength, polarisation).
 
         Raises:
@@ -240,7 +240,7 @@ def efficiencies(
     # The maximum of |q| is (n_i + n_o)/λ.
     solver = order_solver(theory, height_field, 1e-3 * float(np.min(2 * wavelengths / (1 + n))))
     solve = {"none": solver.reflected, "interface": solver.transmitted, "sheet": solver.through_sheet}[transmission]
-    found: dict[tuple[int, ...], Array] = {}
+    found: dict[tuple[int, ...], Real] = {}
     for step, (a, w) in enumerate(np.ndindex(len(angles), len(wavelengths)), 1):
         wavelength = float(wavelengths[w]) * 1e-3
         index = index_at(wavelength, material, int_ior, theory)
@@ -276,7 +276,7 @@ def description(
     return f"{source}; {what}, {theory} theory{transmitted}{plane}"
 
 
-def checked_numbers(name: str, values: ArrayLike, wanted: str, low: float, high: float) -> Array:
+def checked_numbers(name: str, values: ArrayLike, wanted: str, low: float, high: float) -> Real:
     """Return one number or several, all above `low` and below `high`, as (n,)."""
     try:
         array = np.atleast_1d(np.asarray(values, np.float64))

@@ -6,9 +6,9 @@ from dataclasses import dataclass
 from typing import Protocol
 
 import numpy as np
-from numpy.typing import NDArray
 
 from .. import rigorous
+from ..array_types import Complex, Real
 from ..errors import RequestError
 from ..optics.geometry import Orders
 from ..optics.materials import refractive_index
@@ -22,9 +22,6 @@ from ..scalar_theory.closed_form import (
     transmitted_at,
 )
 from ..surface.heightfield import HeightField
-
-Array = NDArray[np.float64]
-Complex = NDArray[np.complex128]
 
 _MAX_ORDERS = 1000  # in scalar theory, which evaluates all pairs of orders for E
 
@@ -48,7 +45,7 @@ class IncidentLight:
     from_below: bool = False
 
     @property
-    def direction(self) -> Array:
+    def direction(self) -> Real:
         """ω_i, (3,), to the light."""
         x, y, z = incident_direction(self.angle, self.azimuth)
         return np.array([x, y, -z if self.from_below else z])
@@ -59,7 +56,7 @@ class IncidentLight:
         here, there = (below, 1.0) if self.from_below else (1.0, below)
         return here, here if reflected else there
 
-    def directions(self, orders: Orders, period: tuple[float, float], reflected: bool) -> Array:
+    def directions(self, orders: Orders, period: tuple[float, float], reflected: bool) -> Real:
         """Return ω_o of orders, (n, 3): n_o ω_o = −n_i ω_i − λ m/T along the surface."""
         n_i, n_o = self.media(reflected)
         m = orders.m if orders.m.ndim == 2 else np.stack([orders.m, np.zeros_like(orders.m)], axis=1)

@@ -16,6 +16,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from scipy.ndimage import gaussian_filter
 
+from ..array_types import Real
 from ..errors import RequestError
 from ..optics.geometry import fresnel
 from ..progress import Progress, silent
@@ -25,8 +26,6 @@ from ..spectrum.power_spectrum import PowerSpectrum
 from ..surface.periods import Period
 from .efficiency import OrderEfficiencies, checked_numbers, description
 from .order_solver import index_at
-
-Array = NDArray[np.float64]
 
 _MAX_SADDLE = 0.5  # of the lower of two peaks
 _EDGE = np.exp(-2.0)  # of its maximum, down to which a peak extends
@@ -116,7 +115,7 @@ def check_request(
     wavelengths: ArrayLike,
     material: str | None,
     int_ior: complex | str | None,
-) -> tuple[Array, Array]:
+) -> tuple[Real, Real]:
     """Return angles (a,) and wavelengths (w,) if the arguments of `peak_efficiencies` are right.
 
     Raises:
@@ -130,7 +129,7 @@ def check_request(
     return checked_numbers("angles", angles, "degrees above −90 and below 90", -90.0, 90.0), wavelengths
 
 
-def _reflected(spectrum: PowerSpectrum, direction: Array, wavelength: float) -> tuple[Array, Array]:
+def _reflected(spectrum: PowerSpectrum, direction: Real, wavelength: float) -> tuple[Real, Real]:
     """Return K G times the power of each node of the spectrum, and ω_i·h, (N_y, N_x); 0 where ω_o is evanescent.
 
     Args:
@@ -141,7 +140,7 @@ def _reflected(spectrum: PowerSpectrum, direction: Array, wavelength: float) -> 
     q = np.stack(np.meshgrid(*spectrum.grid.frequencies()), -1)
     power, cos_half = np.zeros(q.shape[:2]), np.ones(q.shape[:2])
 
-    def of_nodes(kept: NDArray[np.bool_], kappa: Array) -> NDArray[np.floating]:
+    def of_nodes(kept: NDArray[np.bool_], kappa: Real) -> NDArray[np.floating]:
         row, column = np.nonzero(kept)
         return spectrum.table.powers_at(row, column, kappa)
 
@@ -151,7 +150,7 @@ def _reflected(spectrum: PowerSpectrum, direction: Array, wavelength: float) -> 
 
 
 def _peaks(
-    spectrum: PowerSpectrum, power: Array, spacing: list[float]
+    spectrum: PowerSpectrum, power: Real, spacing: list[float]
 ) -> tuple[tuple[Period, ...], list[NDArray[np.bool_]]]:
     """Return the strongest peaks of powers at normal incidence, and the nodes of the mirror direction and of ±q."""
     sigma = [spectrum.lobe_width / step for step in reversed(spacing)]
@@ -173,7 +172,7 @@ def _peaks(
     return tuple(peak for peak, *_ in found), [mirror, *(region for _, *pair in found for region in pair)]
 
 
-def _period(q: Array, weight: Array, strength: float) -> Period:
+def _period(q: Real, weight: Real, strength: float) -> Period:
     """Return the period of a peak from its frequencies, (n, 2), and weights of sum one; with its r.m.s. widths."""
     length = np.hypot(*q.T)
     mean = weight @ length
@@ -184,7 +183,7 @@ def _period(q: Array, weight: Array, strength: float) -> Period:
     return Period(1 / mean, centre.direction, float(width), float(np.sqrt(weight @ off**2)), strength)
 
 
-def _regions(power: Array) -> Iterator[NDArray[np.bool_]]:
+def _regions(power: Real) -> Iterator[NDArray[np.bool_]]:
     """Yield the peaks of powers, (N_y, N_x), as masks."""
     width = power.shape[1] + 2  # of the array with a margin
     owner = [-1] * (width * (power.shape[0] + 2))

@@ -8,8 +8,8 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 import numpy as np
-from numpy.typing import NDArray
 
+from ..array_types import Real
 from ..errors import RequestError
 from ..files.outputs import METADATA
 from ..files.writing import whole_file
@@ -22,7 +22,6 @@ from .properties import Inspection, reference_plane
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
-Array = NDArray[np.float64]
 
 INCIDENCES = (0.0, 30.0, 60.0)  # degrees, of the rows of predicted colours
 _MAX_BINS = 181  # of the spectrum along an axis
@@ -181,7 +180,7 @@ def _spectrum(axes: Axes, inspection: Inspection) -> None:
         )
 
 
-def _strongest(q_x: Array, q_y: Array, power: Array) -> tuple[Array, Array, Array]:
+def _strongest(q_x: Real, q_y: Real, power: Real) -> tuple[Real, Real, Real]:
     """Return the largest power in each bin of a coarser grid, as a single peak would be smaller than a pixel."""
     bins = []
     for axis, q in enumerate((q_x, q_y)):

@@ -17,9 +17,10 @@ from itertools import product
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 from scipy.ndimage import grey_dilation, grey_erosion
 
+from ..array_types import Real
 from ..errors import RequestError
 from ..optics.color import XYZ_to_linear_sRGB, daylight, delta_E, hex_code, into_gamut, spectrum_to_XYZ
 from ..optics.geometry import k_g
@@ -28,13 +29,11 @@ from ..settings import VISIBLE
 from ..surface.heightfield import HeightField
 from ..surface.periods import Period, find_periods
 
-Array = NDArray[np.float64]
-
 MAX_COLOUR_COHERENCE_LENGTH = 20.0  # µm; at 65 µm orders of one wavelength are narrower than a pixel of the picture
 WAVELENGTHS = np.arange(VISIBLE[0], VISIBLE[1] + 1, 2.0)  # nm; fine enough for these lobes
 
 
-def illumination() -> Array:
+def illumination() -> Real:
     """Return D65 at `WAVELENGTHS`, of luminance Y = 1."""
     values = daylight(WAVELENGTHS)
     return values / spectrum_to_XYZ(values, WAVELENGTHS)[1]
@@ -48,7 +47,7 @@ def radiance(
     *,
     height_scale: float = 1.0,
     lateral_scale: float = 1.0,
-) -> Array:
+) -> Real:
     """Compute L(λ), defined in the docstring of this module.
 
     Heights scaled by s have the spectrum S(q; s κ). A surface stretched by s has s² S(s q; κ), where the coherence
@@ -180,7 +179,7 @@ class _View(NamedTuple):
         """Return `order_fraction` at 550 nm."""
         return order_fraction(self.spectrum, self.direction, self.period, order, GREEN, **self.scale)
 
-    def XYZ(self, theta_o: float) -> Array:
+    def XYZ(self, theta_o: float) -> Real:
         """Return non-negative XYZ in a direction, degrees."""
         spectra = radiance(self.spectrum, self.direction, 0.0, theta_o, **self.scale)
         return np.maximum(spectrum_to_XYZ(spectra, WAVELENGTHS), 0)

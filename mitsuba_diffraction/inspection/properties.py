@@ -6,8 +6,8 @@ import warnings
 from dataclasses import dataclass, field
 
 import numpy as np
-from numpy.typing import NDArray
 
+from ..array_types import Real
 from ..files.outputs import plain
 from ..precomputation.grating_spectrum import GratingSpectrum
 from ..precomputation.spectra import precompute
@@ -19,8 +19,6 @@ from ..surface.heightfield import HeightField
 from ..surface.periods import Period, find_periods, hann
 from ..surface.prepare import white_noise
 from .predicted_colours import CHANGE, MAX_COLOUR_COHERENCE_LENGTH, Change, changes, same_period
-
-Array = NDArray[np.float64]
 
 _TOLERANCE = 0.02
 _MAX_PIECE_SIZE = 20.0  # µm, side of the part of a large scan from which colours are predicted
@@ -241,7 +239,7 @@ def statistics(height_field: HeightField, *, extent: str = "sample") -> Statisti
     )
 
 
-def reference_plane(height_field: HeightField, extent: str) -> tuple[Array, tuple[float, float]]:
+def reference_plane(height_field: HeightField, extent: str) -> tuple[Real, tuple[float, float]]:
     """Return the reference plane of the heights, (N_y, N_x) µm, and its slopes along x and y.
 
     For a sample, the least-squares plane; for a tile, which is periodic, a level plane.

@@ -17,15 +17,14 @@ from dataclasses import dataclass
 
 import numpy as np
 import scipy.fft
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 from scipy.special import ndtr
 
+from ..array_types import Real
 from ..settings import lobe_width
 
-Array = NDArray[np.float64]
 
-
-def blurred_texels(texels: int, per_texel: int, blur: float) -> Array:
+def blurred_texels(texels: int, per_texel: int, blur: float) -> Real:
     """Return U, (texels · per_texel, texels): squares convolved with a Gaussian, at the pixels of one period.
 
     Args:
@@ -41,7 +40,7 @@ def blurred_texels(texels: int, per_texel: int, blur: float) -> Array:
     )
 
 
-def lobes_in_bins(edges: Array, orders: ArrayLike, period: float, wavelength: float, coherence_length: float) -> Array:
+def lobes_in_bins(edges: Real, orders: ArrayLike, period: float, wavelength: float, coherence_length: float) -> Real:
     """Return A, (bins, orders): the integrals of the lobes of orders over bins along one axis.
 
     With light along the normal, the lobe of the order m is a Gaussian about ω_o = −λ m/T of standard deviation λ σ_q.
@@ -69,16 +68,16 @@ class FarField:
         wanted: t, (w, bins, bins), rows ↔ +y; sums to one at most for each wavelength.
     """
 
-    texels: Array
-    kappa: Array
-    lobes: Array
-    wanted: Array
+    texels: Real
+    kappa: Real
+    lobes: Real
+    wanted: Real
 
-    def relief(self, heights: Array) -> Array:
+    def relief(self, heights: Real) -> Real:
         """Return z, (pixels, pixels) µm, of the heights h of the texels, rows ↔ +y."""
         return self.texels @ heights @ self.texels.T
 
-    def loss(self, heights: Array) -> tuple[float, Array]:
+    def loss(self, heights: Real) -> tuple[float, Real]:
         """Return L and ∂L/∂h, (texels, texels) 1/µm, at the heights h of the texels in µm."""
         dtype = self.lobes.dtype
         kappa, transposed = self.kappa[:, None, None].astype(dtype), self.lobes.swapaxes(1, 2)
@@ -97,7 +96,7 @@ class FarField:
         return value, self.texels.T @ gradient @ self.texels
 
 
-def nearest_levels(heights: Array, height_range: float, levels: int) -> Array:
+def nearest_levels(heights: Real, height_range: float, levels: int) -> Real:
     """Return the nearest of the levels k · height_range/(levels − 1), k = 0 … levels − 1."""
     step = height_range / (levels - 1)
     return np.clip(np.rint(heights / step), 0, levels - 1) * step

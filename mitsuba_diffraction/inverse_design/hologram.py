@@ -17,10 +17,10 @@ from pathlib import Path
 
 import numpy as np
 import OpenEXR
-from numpy.typing import NDArray
 from PIL import Image
 from scipy.special import j1, jnp_zeros
 
+from ..array_types import Real
 from ..errors import RequestError
 from ..files.outputs import MARK
 from ..files.picture_file import read_picture
@@ -34,10 +34,8 @@ BAND = 0.06  # relative width of the band of wavelengths that reaches the eye, b
 LIGHT, EYE = (-12.0, 22.0, 52.0), (0.0, -44.0, 44.0)  # of hologram.xml
 WHITE_QUANTILE = 0.995  # of the stripes' brightness, shown with the maximum efficiency of a grating
 
-Array = NDArray[np.float64]
 
-
-def stripe_brightness(linear: Array) -> Array:
+def stripe_brightness(linear: Real) -> Real:
     """Return the brightness of the three stripes, from 0 to 1, for linear sRGB (rows, columns, 3)."""
     wavelengths = np.arange(380, 781) * 1e-3
     bands = np.exp(-0.5 * ((wavelengths[:, None] / STRIPE_WAVELENGTHS - 1) / BAND) ** 2)
@@ -45,13 +43,13 @@ def stripe_brightness(linear: Array) -> Array:
     return np.minimum(stripes / max(np.quantile(stripes.max(-1), WHITE_QUANTILE), 1e-3), 1)
 
 
-def directions(points: Array, target: Array) -> Array:
+def directions(points: Real, target: Real) -> Real:
     """Return unit vectors (..., 3) from points to one target."""
     offset = target - points
     return offset / np.linalg.norm(offset, axis=-1, keepdims=True)
 
 
-def stripes(brightness: Array) -> tuple[Array, Array, Array]:
+def stripes(brightness: Real) -> tuple[Real, Real, Real]:
     """Return lateral scale, height scale and orientation in degrees of stripes, (rows, 3 columns) each.
 
     Args:
@@ -71,7 +69,7 @@ def stripes(brightness: Array) -> tuple[Array, Array, Array]:
     return lateral, heights, np.rad2deg(np.arctan2(cosines[..., 1], cosines[..., 0]))
 
 
-def fitted(picture: str | os.PathLike[str], columns: int) -> Array:
+def fitted(picture: str | os.PathLike[str], columns: int) -> Real:
     """Return a picture in linear sRGB with its proportions, in the middle of the hologram, which is dark beside it.
 
     Args:
@@ -102,7 +100,7 @@ def textures_in(folder: Path) -> list[Path]:
     return [folder / f"hologram_{name}.exr" for name in ("lateral", "heights", "turn")]
 
 
-def write(picture: str | os.PathLike[str], folder: Path, columns: int = 400) -> tuple[Array, Array, Array]:
+def write(picture: str | os.PathLike[str], folder: Path, columns: int = 400) -> tuple[Real, Real, Real]:
     """Write the textures of a picture, `columns` pixels wide, and return them; for errors see `fitted`."""
     found = stripes(stripe_brightness(fitted(picture, columns)))
     header = {"type": OpenEXR.scanlineimage, "compression": OpenEXR.ZIP_COMPRESSION, "comments": MARK}

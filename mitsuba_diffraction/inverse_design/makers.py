@@ -9,11 +9,11 @@ from typing import Any
 
 import numpy as np
 
+from ..array_types import Real
 from ..errors import RequestError, pip_install
 from ..files.outputs import MARK
 from ..files.writing import whole_file
 from ..surface.heightfield import HeightField
-from .far_field import Array
 from .output import simple_field
 from .result import Design
 
@@ -44,7 +44,7 @@ def save_stl(field: HeightField, path: str | os.PathLike[str]) -> None:
         temporary.write_bytes(header + np.uint32(len(faces)).astype("<u4").tobytes() + faces.tobytes())
 
 
-def _triangles(points: Array) -> Array:
+def _triangles(points: Real) -> Real:
     """Return the two triangles of each cell of a grid of points, (rows, columns, 3): (n, 3, 3)."""
     a, b, c, d = points[:-1, :-1], points[:-1, 1:], points[1:, 1:], points[1:, :-1]
     return np.concatenate([np.stack(corners, axis=-2).reshape(-1, 3, 3) for corners in ((a, b, c), (a, c, d))])

@@ -8,10 +8,11 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import ArrayLike
 
+from ..array_types import Real
 from ..errors import RequestError, check_whole, is_number
 from ..optics.materials import MAX_CLEAR_K, index_of
 from ..settings import MIN_WAVELENGTH, VISIBLE
-from .far_field import Array, blurred_texels
+from .far_field import blurred_texels
 
 _MAX_TEXELS = 256
 _ORDERS_PER_STROKE = 3.0  # of the finest strokes of a picture; see the eye chart in docs/design.md
@@ -65,7 +66,7 @@ class Plate:
     texels: int
     height_range: float
     angle: float
-    wavelengths: Array
+    wavelengths: Real
     int_ior: float | str | None
     levels: int | None
     tool_blur: float
@@ -153,7 +154,7 @@ class Plate:
         return 2 * math.sin(math.radians(self.angle)) * self.period / (float(self.wavelengths.min()) * 1e-3)
 
     @property
-    def kappa(self) -> Array:
+    def kappa(self) -> Real:
         """κ in rad/µm of each wavelength, (w,), halfway between the middle of the picture and its edge.
 
         2π (1 + cos θ)/λ. For a sheet whose relief the light meets first, 2π (1 − √(n² − sin² θ))/λ, which is negative.
@@ -165,7 +166,7 @@ class Plate:
         )
         return 2 * np.pi * path / (self.wavelengths * 1e-3)
 
-    def index(self, wavelengths: ArrayLike) -> Array:
+    def index(self, wavelengths: ArrayLike) -> Real:
         """Return n of a sheet at wavelengths in µm."""
         assert self.int_ior is not None
         return index_of("int_ior", self.int_ior)(wavelengths).real
@@ -186,10 +187,10 @@ class Plate:
             return shortest, longest
         return min(shortest, VISIBLE[0]), max(longest, VISIBLE[1])
 
-    def edges(self, bins: int) -> Array:
+    def edges(self, bins: int) -> Real:
         """Return the edges of bins of equal width across the picture, in direction cosines, (bins + 1,)."""
         return np.linspace(-1, 1, bins + 1) * math.sin(math.radians(self.angle))
 
-    def spread(self, per_texel: int, blur_scale: float = 1.0) -> Array:
+    def spread(self, per_texel: int, blur_scale: float = 1.0) -> Real:
         """Return U of `blurred_texels` for this plate, with a blur of the tool that is larger by a factor."""
         return blurred_texels(self.texels, per_texel, blur_scale * self.tool_blur / self.texel)

@@ -9,13 +9,14 @@ from dataclasses import dataclass, field
 import numpy as np
 from numpy.typing import NDArray
 
+from ..array_types import Real
 from ..optics.color import delta_E, lamp_to_linear_sRGB, linear_sRGB_to_XYZ
 from ..optics.geometry import diffracted
 from ..scalar_theory.closed_form import tile_powers, transmitted_orders
 from ..scalar_theory.validity import scalar_error
 from ..settings import lobe_width
 from ..surface.heightfield import HeightField
-from .far_field import Array, lobes_in_bins
+from .far_field import lobes_in_bins
 from .plate import Plate
 
 _PIXEL = 1 / 4  # of the shortest wavelength, at most: resolves all frequencies that light reaches
@@ -41,17 +42,17 @@ class Design:
         interrupted: whether the search was interrupted.
     """
 
-    texels: Array = field(repr=False)
+    texels: Real = field(repr=False)
     height_field: HeightField
     plate: Plate = field(repr=False)
-    wanted: Array = field(repr=False)
-    predicted: Array = field(repr=False)
-    mirror: Array
-    changed: Mapping[str, Array]
+    wanted: Real = field(repr=False)
+    predicted: Real = field(repr=False)
+    mirror: Real
+    changed: Mapping[str, Real]
     interrupted: bool = False
 
     @classmethod
-    def of(cls, heights: Array, plate: Plate, wanted: Array, interrupted: bool = False) -> Design:
+    def of(cls, heights: Real, plate: Plate, wanted: Real, interrupted: bool = False) -> Design:
         """Predict the far field of texels of the given heights, (texels, texels) µm."""
         field = _relief(heights, plate)
         predicted, mirror = _far_field(field, plate, plate.wavelengths, wanted.shape[1])
@@ -62,7 +63,7 @@ class Design:
         return cls(heights, field, plate, wanted, predicted, mirror, changed, interrupted)
 
     @property
-    def wavelengths(self) -> Array:
+    def wavelengths(self) -> Real:
         """In nm, (w,)."""
         return self.plate.wavelengths
 
@@ -72,16 +73,16 @@ class Design:
         return _inside(self.wanted)
 
     @property
-    def efficiency(self) -> Array:
+    def efficiency(self) -> Real:
         """The fraction of the light in the target, (w,)."""
         return _efficiency(self.predicted, self.wanted)
 
     @property
-    def usable(self) -> Array:
+    def usable(self) -> Real:
         """The fraction of the light that the target can use, (w,): one where no colour leaves any out."""
         return self.wanted.sum(axis=(1, 2))
 
-    def in_picture(self, efficiency: Array, wavelengths: Array | None = None) -> Array:
+    def in_picture(self, efficiency: Real, wavelengths: Real | None = None) -> Real:
         """Return the fraction in the picture of the light that it can use, (w,), from the fraction of all light.
 
         At other `wavelengths` than those of the design, nm, its targets are those of the nearest ones.
@@ -108,7 +109,7 @@ class Design:
         return float(np.mean([(bright - dark) / (bright + dark) for bright, dark in radiances]))
 
     @property
-    def correlation(self) -> Array:
+    def correlation(self) -> Real:
         """Pearson's correlation of wanted and predicted light over the bins, (w,)."""
         pairs, judged = zip(self.wanted, self.predicted, strict=True), self._judged
         return np.array([np.corrcoef(t[judged], p[judged])[0, 1] for t, p in pairs])
@@ -122,12 +123,12 @@ class Design:
         return np.hypot(*np.meshgrid(middles, middles)) > (lobe if self.plate.unused == "mirror" else -1.0)
 
     @property
-    def unevenness(self) -> Array:
+    def unevenness(self) -> Real:
         """The standard deviation of predicted by wanted light over the target, relative to its mean, (w,)."""
         ratios = [p[i] / t[i] for p, t, i in zip(self.predicted, self.wanted, self.inside, strict=True)]
         return np.array([ratio.std() / ratio.mean() for ratio in ratios])
 
-    def colours(self, light: Array) -> Array:
+    def colours(self, light: Real) -> Real:
         """Return linear sRGB, (bins, bins, 3), of light in the bins, (w, bins, bins); the brightest channel of the
         target is 1. Grey for a laser.
         """
@@ -135,7 +136,7 @@ class Design:
         return np.moveaxis(light, 0, -1) @ matrix / (np.moveaxis(self.wanted, 0, -1) @ matrix).max()
 
     @property
-    def seen(self) -> tuple[Array, Array]:
+    def seen(self) -> tuple[Real, Real]:
         """Linear sRGB of target and prediction, equally bright, as they are seen, rows from the bottom."""
         target, predicted = (self.colours(light) for light in (self.wanted, self.predicted))
         bright, found = (linear_sRGB_to_XYZ(colours)[self._judged, 1].sum() for colours in (target, predicted))
@@ -154,7 +155,7 @@ class Design:
         """A sentence if the relief is outside the range of scalar theory, otherwise ""."""
         return scalar_error(self.height_field, light=(self.wavelengths.min(), self.wavelengths.max())).warning
 
-    def efficiencies(self, wavelengths: Array) -> Array:
+    def efficiencies(self, wavelengths: Real) -> Real:
         """Return the fraction of the light in the target at other wavelengths in nm, (n,).
 
         At each wavelength the target of the nearest wavelength of the design is used.
@@ -162,7 +163,7 @@ class Design:
         predicted = _far_field(self.height_field, self.plate, wavelengths, self.wanted.shape[1])[0]
         return _efficiency(predicted, self.wanted[self._nearest(wavelengths)])
 
-    def _nearest(self, wavelengths: Array) -> NDArray[np.intp]:
+    def _nearest(self, wavelengths: Real) -> NDArray[np.intp]:
         return np.abs(np.subtract.outer(wavelengths, self.wavelengths)).argmin(axis=1)
 
 
@@ -178,7 +179,7 @@ def memory_of_prediction(plate: Plate) -> float:
     return _BYTES_PER_PIXEL * float(plate.texels * _pixels_per_texel(plate)) ** 2
 
 
-def _relief(heights: Array, plate: Plate, blur_scale: float = 1.0) -> HeightField:
+def _relief(heights: Real, plate: Plate, blur_scale: float = 1.0) -> HeightField:
     """Return one period of the relief."""
     per_texel = _pixels_per_texel(plate)
     spread = plate.spread(per_texel, blur_scale)
@@ -186,7 +187,7 @@ def _relief(heights: Array, plate: Plate, blur_scale: float = 1.0) -> HeightFiel
     return HeightField(spread @ heights @ spread.T, plate.texel / per_texel, source)
 
 
-def _far_field(relief: HeightField, plate: Plate, wavelengths: Array, bins: int) -> tuple[Array, Array]:
+def _far_field(relief: HeightField, plate: Plate, wavelengths: Real, bins: int) -> tuple[Real, Real]:
     """Return the fractions of the light in the bins, (w, bins, bins), and in order 0, (w,).
 
     Orders have the powers of the BSDF, each at its own κ, with K G or, for a sheet, K_t G_t (1 − F).
@@ -217,9 +218,9 @@ def _far_field(relief: HeightField, plate: Plate, wavelengths: Array, bins: int)
     return np.array(predicted), np.array(mirror)
 
 
-def _inside(wanted: Array) -> NDArray[np.bool_]:
+def _inside(wanted: Real) -> NDArray[np.bool_]:
     return wanted > _BRIGHT * wanted.max(axis=(1, 2), keepdims=True)
 
 
-def _efficiency(predicted: Array, wanted: Array) -> Array:
+def _efficiency(predicted: Real, wanted: Real) -> Real:
     return np.where(_inside(wanted), predicted, 0).sum(axis=(1, 2))

@@ -12,11 +12,12 @@ import scipy.ndimage
 import scipy.optimize
 from numpy.typing import ArrayLike, NDArray
 
+from ..array_types import Real
 from ..errors import RequestError, check_whole
 from ..progress import Progress, silent
 from ..rigorous.solver import one_thread
 from ..settings import MIN_WAVELENGTH
-from .far_field import Array, FarField, lobes_in_bins, nearest_levels
+from .far_field import FarField, lobes_in_bins, nearest_levels
 from .plate import Plate
 from .result import Design, memory_of_prediction
 from .target import wanted_fractions, with_unused
@@ -113,7 +114,7 @@ def design(
     return Design.of(heights, plate, wanted, interrupted)
 
 
-def _wavelengths(given: float | Sequence[float] | None) -> Array:
+def _wavelengths(given: float | Sequence[float] | None) -> Real:
     """Return the wavelengths in nm as an array."""
     try:
         found = WHITE if given is None else np.atleast_1d(np.asarray(given, np.float64))
@@ -125,7 +126,7 @@ def _wavelengths(given: float | Sequence[float] | None) -> Array:
 
 
 def far_field_of(
-    plate: Plate, wanted: Array, coherence_length: float, per_texel: int, dtype: type = np.float32
+    plate: Plate, wanted: Real, coherence_length: float, per_texel: int, dtype: type = np.float32
 ) -> FarField:
     """Return the map from heights to light in the bins of `wanted`, (w, bins, bins), at a coherence length in µm.
 
@@ -138,7 +139,7 @@ def far_field_of(
     return FarField(plate.spread(per_texel), plate.kappa, np.array(lobes, dtype), wanted.astype(dtype))
 
 
-def _seconds(far_field: FarField, heights: Array) -> float:
+def _seconds(far_field: FarField, heights: Real) -> float:
     """Return how long one evaluation of the loss takes; the first one, which allocates memory, takes longer."""
     far_field.loss(heights)
     begin = time.perf_counter()
@@ -151,16 +152,16 @@ class _Search:
     """The search for the heights of the texels; an exception, such as KeyboardInterrupt, loses nothing."""
 
     def __init__(
-        self, plate: Plate, wanted: Array, starts: int, progress: Progress, expect: Callable[[float, float], None]
+        self, plate: Plate, wanted: Real, starts: int, progress: Progress, expect: Callable[[float, float], None]
     ) -> None:
         self._expect = expect
         self._plate, self._wanted, self._starts = plate, wanted, starts
         self._progress, self._done, self._total = progress, 0, starts * 2 * _FIRST_ITERATIONS + _LAST_ITERATIONS
         # Loss and heights of the best relief of each start.
-        self._found: list[tuple[float, Array]] = []
+        self._found: list[tuple[float, Real]] = []
 
     @property
-    def heights(self) -> Array:
+    def heights(self) -> Real:
         """The heights with the smallest loss so far, (texels, texels) µm."""
         flat = np.zeros(2 * (self._plate.texels,))
         return min(self._found, key=lambda pair: pair[0], default=(0.0, flat))[1]
@@ -192,7 +193,7 @@ class _Search:
             heights = np.where(fixed, nearest, heights)
             self._found = [(fine.loss(heights)[0], heights)]
 
-    def _random_relief(self, random: np.random.Generator) -> Array:
+    def _random_relief(self, random: np.random.Generator) -> Real:
         """Return smooth random heights, steep enough for light to reach the edges of the picture."""
         plate = self._plate
         # A facet of slope s directs light to the direction cosine s times the phase per height, κλ/2π.
@@ -203,12 +204,12 @@ class _Search:
         return plate.height_range * (smooth - smooth.min()) / max(np.ptp(smooth), 1e-30)
 
     def _minimised(
-        self, far_field: FarField, heights: Array, iterations: int, fixed: NDArray[np.bool_] | bool = False
-    ) -> Array:
+        self, far_field: FarField, heights: Real, iterations: int, fixed: NDArray[np.bool_] | bool = False
+    ) -> Real:
         """Return the heights of the smallest loss that L-BFGS-B finds from `heights`, some of them `fixed`."""
         self._found.append((math.inf, heights))
 
-        def loss(flat: Array) -> tuple[float, Array]:
+        def loss(flat: Real) -> tuple[float, Real]:
             value, gradient = far_field.loss(flat.reshape(heights.shape))
             if value < self._found[-1][0]:
                 self._found[-1] = value, flat.reshape(heights.shape).copy()

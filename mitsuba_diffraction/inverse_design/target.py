@@ -8,9 +8,10 @@ import numpy as np
 import scipy.ndimage
 from numpy.typing import ArrayLike
 
+from ..array_types import Real
 from ..errors import RequestError
 from ..optics.color import lamp_to_linear_sRGB, upsampled
-from .far_field import Array, lobes_in_bins
+from .far_field import lobes_in_bins
 from .plate import Plate
 
 _BINS_PER_ORDER = 1.5
@@ -18,7 +19,7 @@ _MAX_PIXELS = 512  # along an edge, in which strokes are measured
 _KEPT = 0.9  # of the bright part, by discs as wide as its finest strokes
 
 
-def wanted_fractions(target: ArrayLike, plate: Plate) -> Array:
+def wanted_fractions(target: ArrayLike, plate: Plate) -> Real:
     """Return t, the wanted fraction of the light in each bin, (w, bins, bins), rows ↔ +y.
 
     Pixels are squares: the longer edge of the picture fills the frame, and the rest of it is dark. Colours are
@@ -62,7 +63,7 @@ def wanted_fractions(target: ArrayLike, plate: Plate) -> Array:
     return wanted
 
 
-def with_unused(wanted: Array, plate: Plate) -> Array:
+def with_unused(wanted: Real, plate: Plate) -> Real:
     """Return t with the light that the colours leave unused in the lobe of order 0, if the plate wants it there."""
     if plate.unused != "mirror":
         return wanted
@@ -94,14 +95,14 @@ def finest_strokes(target: ArrayLike) -> float:
     return max(grey.shape) / step / (2 * radius - 2.5)
 
 
-def _in_bins(channels: Array, count: int) -> Array:
+def _in_bins(channels: Real, count: int) -> Real:
     """Return a picture, rows from the top, in square bins, rows from the bottom: (count, count, channels)."""
     size = max(channels.shape[:2])
     rows, columns = (_overlaps(n, size, count) for n in channels.shape[:2])
     return np.einsum("ir,rcs,jc->ijs", rows, channels[::-1], columns) * (count / size) ** 2
 
 
-def _overlaps(pixels: int, length: int, bins: int) -> Array:
+def _overlaps(pixels: int, length: int, bins: int) -> Real:
     """Return the length of each pixel in each of the bins, (bins, pixels), in pixels.
 
     The bins are `length` long in all, and the pixels in the middle of them.

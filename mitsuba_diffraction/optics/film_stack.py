@@ -23,10 +23,10 @@ from functools import partial
 import numpy as np
 from numpy.typing import NDArray
 
+from ..array_types import Real
 from .geometry import AnyArray
 from .materials import NOMINAL_WAVELENGTH, RefractiveIndex
 
-Real = NDArray[np.float64]
 Plane = Callable[[Real], tuple[Real, Real]]
 """R and T of unpolarised light at the cosines of the angles of incidence."""
 

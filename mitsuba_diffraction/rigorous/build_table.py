@@ -18,6 +18,7 @@ from zipfile import BadZipFile
 import numpy as np
 from numpy.typing import NDArray
 
+from ..array_types import Real
 from ..errors import RequestError
 from ..files.writing import whole_file
 from ..optics.materials import index_of, refractive_index
@@ -55,7 +56,6 @@ from .solver import (
     wave_numbers,
 )
 
-Real = NDArray[np.float64]
 # n of the incident and of the outgoing orders, and their matrices, (outgoing orders, incident orders, 4, 4).
 _Orders = tuple[NDArray[np.int64], NDArray[np.int64], NDArray[Any]]
 # α, g, λ, whether an order is near its Rayleigh anomaly, and (side of incidence, side of exit) → m and M_ij, (n, 4, 4).

@@ -45,11 +45,9 @@ from scipy.linalg import lu_factor, lu_solve, schur, toeplitz
 from scipy.linalg.lapack import ztrsen
 from scipy.ndimage import median_filter
 
+from ..array_types import Complex, Real
 from ..errors import RequestError
 from ..surface.heightfield import HeightField
-
-Real = NDArray[np.float64]
-Complex = NDArray[np.complex128]
 
 SAMPLES = 4096
 _WALL_WIDTH = 1e-6  # in periods: no tilt admits vertical walls of both sides

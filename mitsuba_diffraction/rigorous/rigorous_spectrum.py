@@ -18,13 +18,12 @@ from typing import Any, cast
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from ..array_types import Real
 from ..errors import RequestError
 from ..settings import RigorousSettings, lobe_cutoff, lobe_width
 from ..spectrum.exr import doubles, one_line, read_channels, write_channels
 from ..spectrum.grids import OrderGrid
 from .solver import ODD, REVERSED
-
-Real = NDArray[np.float64]
 
 RIGOROUS_FORMAT = "mitsuba_diffraction rigorous spectrum"
 RIGOROUS_FORMAT_VERSION = 6

@@ -13,14 +13,12 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from threadpoolctl import ThreadpoolController
 
+from ..array_types import Complex, Real
 from ..errors import RequestError
 from ..optics.geometry import Orders
 from ..optics.materials import refractive_index
 from ..surface.heightfield import HeightField
 from .coordinate_transformation import ABOVE, BELOW, Curve, CurveMatrices, Scattered, curve_of, half_space, scatter
-
-Real = NDArray[np.float64]
-Complex = NDArray[np.complex128]
 
 # S_i = E† σ_i E, in the order of Stokes parameters; the sign of the last is Mitsuba's, with n + ik for metals.
 _PAULI = np.array([[[1, 0], [0, 1]], [[1, 0], [0, -1]], [[0, 1], [1, 0]], [[0, 1j], [-1j, 0]]])

@@ -14,18 +14,18 @@ from numpy.polynomial import chebyshev
 from numpy.typing import ArrayLike, NDArray
 from scipy.special import jv
 
+from ..array_types import Real
 from ..errors import RequestError
 from ..optics.geometry import Diffracted, Orders, diffracted, fresnel
 from ..spectrum.grids import OrderGrid
 from ..surface.heightfield import HeightField
 from .reference import amplitudes
 
-Array = NDArray[np.float64]
-OrderPowers = Callable[[NDArray[np.int64], Array], Array]
+OrderPowers = Callable[[NDArray[np.int64], Real], Real]
 """(m, κ), broadcast against each other → η_m(κ)."""
 
 
-def incident_direction(angle: float, azimuth: float) -> Array:
+def incident_direction(angle: float, azimuth: float) -> Real:
     """Return ω_i, (3,), from the angle of incidence and the azimuth of its plane in degrees."""
     theta, phi = np.deg2rad((angle, azimuth))
     return np.array([-np.sin(theta) * np.cos(phi), -np.sin(theta) * np.sin(phi), np.cos(theta)])
@@ -42,7 +42,7 @@ def profile_powers(height_field: HeightField) -> OrderPowers:
         raise RequestError(f"height_field: got {height_field.shape[0]} rows, wanted a profile of one")
     heights, count = height_field.centred[0], height_field.shape[1]
 
-    def powers(m: NDArray[np.int64], kappa: Array) -> Array:
+    def powers(m: NDArray[np.int64], kappa: Real) -> Real:
         m, kappa = np.broadcast_arrays(m, kappa)
         waves = np.exp(1j * (kappa[..., None] * heights - 2 * np.pi * m[..., None] * np.arange(count) / count))
         return np.where(2 * np.abs(m) < count, np.abs(waves.mean(axis=-1)) ** 2, 0.0)
@@ -61,12 +61,12 @@ def tile_powers(height_field: HeightField, shortest: float) -> OrderPowers:
     grid = OrderGrid.reachable(height_field.tile_size, height_field.shape[::-1], 2 / shortest)
     m_x, m_y = (axis.ravel() for axis in np.meshgrid(*grid.axes()))
 
-    def of_nodes(x: Array) -> Any:
+    def of_nodes(x: Real) -> Any:
         return np.stack([amplitudes(height_field, kappa)[m_y, m_x] for kappa in max_kappa / 2 * (x + 1)])
 
     coefficients: Any = chebyshev.chebinterpolate(of_nodes, degree)
 
-    def powers(m: NDArray[np.int64], kappa: Array) -> Array:
+    def powers(m: NDArray[np.int64], kappa: Real) -> Real:
         inside = np.asarray((np.abs(m) <= grid.max_order).all(axis=-1))
         columns, rows = np.moveaxis(np.where(inside[..., None], m + grid.max_order, 0), -1, 0)
         waves = chebyshev.chebvander(2 * kappa / max_kappa - 1, degree)
@@ -101,7 +101,7 @@ def scalar_orders(
     """
     m, steps = _lattice(wavelength / np.atleast_1d(period), 2.0)
 
-    def of_orders(kept: NDArray[np.bool_], kappa: Array) -> Array:
+    def of_orders(kept: NDArray[np.bool_], kappa: Real) -> Real:
         return powers(m[kept], kappa)
 
     found, power = mirrored(of_orders, incident_direction(angle, azimuth)[:2], steps, wavelength)
@@ -112,8 +112,8 @@ def scalar_orders(
 
 
 def mirrored(
-    powers: Callable[[NDArray[np.bool_], Array], NDArray[np.floating]], tangent: Array, steps: Array, wavelength: float
-) -> tuple[Diffracted, Array]:
+    powers: Callable[[NDArray[np.bool_], Real], NDArray[np.floating]], tangent: Real, steps: Real, wavelength: float
+) -> tuple[Diffracted, Real]:
     """Return the directions of diffracted light, (n,), and K G S there, which a perfect mirror reflects without E.
 
     Args:
@@ -150,7 +150,7 @@ def transmitted_at(
     powers: OrderPowers,
     period: float | tuple[float, float],
     wavelength: float,
-    tangent: Array,
+    tangent: Real,
     index: float,
     from_below: bool = False,
     sheet: bool = False,
@@ -172,7 +172,7 @@ def transmitted_at(
     return Orders(m, s, p)
 
 
-def _lattice(pitch: Array, cutoff: float) -> tuple[NDArray[np.int64], Array]:
+def _lattice(pitch: Real, cutoff: float) -> tuple[NDArray[np.int64], Real]:
     """Return m up to |m| λ/T = `cutoff`, (n,) of a profile or (n, 2), and m λ/T along x and y, (n, 2)."""
     axes = [np.arange(-int(cutoff / p) - 1, int(cutoff / p) + 2) for p in pitch]
     m = np.stack(np.meshgrid(*axes, indexing="ij"), -1)

@@ -11,12 +11,11 @@ import numpy as np
 import scipy.fft
 from numpy.typing import ArrayLike, NDArray
 
+from ..array_types import Real
 from ..errors import RequestError
 from ..settings import SUN_COHERENCE_LENGTH, ScalarSettings, lobe_width, matching
 from ..spectrum.sample import UNIFORM, WindowAxis, effective_coherence_length, window_axes
 from ..surface.heightfield import HeightField
-
-Real = NDArray[np.float64]
 
 _MAX_SIGMAS = 9.0  # radius of a lobe, standard deviations; e^{−9²/2} is under 3e-18
 MAX_CHUNK = 2**20  # complex numbers in an intermediate array, 16 MiB

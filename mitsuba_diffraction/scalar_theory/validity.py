@@ -14,8 +14,8 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from ..array_types import Real
 from ..errors import RequestError
 from ..rigorous.coordinate_transformation import curve_of, is_profile
 from ..rigorous.rigorous_spectrum import MAX_PERIOD_IN_WAVELENGTHS
@@ -28,7 +28,6 @@ from .closed_form import efficiency_difference, profile_powers, scalar_orders, t
 if TYPE_CHECKING:
     from scipy.interpolate import RegularGridInterpolator
 
-Array = NDArray[np.float64]
 
 MAP = Path(__file__).parents[1] / "data" / "scalar_error.json"
 
@@ -52,7 +51,7 @@ def equivalent_depth(rms_height: float) -> float:
 
 
 @functools.cache
-def error_map(material: str = "dielectric") -> tuple[Array, Array, Array, Array]:
+def error_map(material: str = "dielectric") -> tuple[Real, Real, Real, Real]:
     """Return the error of scalar theory for sinusoids in unpolarised light (`tools/data/scalar_theory_map.py`).
 
     Args:

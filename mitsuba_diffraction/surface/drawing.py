@@ -6,6 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.special import erf
 
+from ..array_types import Real
 from ..errors import RequestError, check_whole, is_number
 from .heightfield import HeightField, as_pixel_size
 
@@ -14,8 +15,6 @@ MAX_PIXELS = 2**26
 
 MAX_PERIOD = 100.0
 """µm: orders of visible light are 0.3° apart, about the width of the sun. A period given in nm is larger."""
-
-Array = NDArray[np.float64]
 
 
 def check_pixels(columns: float, rows: float) -> None:
@@ -51,12 +50,12 @@ def generator(seed: int) -> np.random.Generator:
     return np.random.default_rng(int(seed))
 
 
-def phase(samples: int) -> Array:
+def phase(samples: int) -> Real:
     """Return x / period at the centres of the pixels, (samples,)."""
     return (np.arange(samples) + 0.5) / samples
 
 
-def one_row(heights: Array, period: float, source: str) -> HeightField:
+def one_row(heights: Real, period: float, source: str) -> HeightField:
     return HeightField(heights[None, :], (period / len(heights), period), source)
 
 
@@ -95,13 +94,13 @@ class Canvas:
         self.pixel = (self.size[0] / columns, self.size[1] / rows)
         self.heights = np.zeros((rows, columns))
 
-    def centres(self, axis: int) -> Array:
+    def centres(self, axis: int) -> Real:
         """Return the centres of the pitches along x (0) or y (1), µm."""
         return (np.arange(self.count[axis], dtype=np.float64) + 0.5) * self.pitch[axis]
 
     def window(
         self, x: tuple[float, float], y: tuple[float, float]
-    ) -> tuple[tuple[NDArray[np.signedinteger], ...], Array, Array]:
+    ) -> tuple[tuple[NDArray[np.signedinteger], ...], Real, Real]:
         """Return the pixels of the box x[0]…x[1], y[0]…y[1] µm.
 
         Returns:
@@ -116,7 +115,7 @@ class Canvas:
         x_index, y_index = columns[None, :].astype(np.float64), rows[:, None].astype(np.float64)
         return index, (x_index + 0.5) * self.pixel[0], (y_index + 0.5) * self.pixel[1]
 
-    def noise(self, rng: np.random.Generator, length_x: float, length_y: float) -> Array:
+    def noise(self, rng: np.random.Generator, length_x: float, length_y: float) -> Real:
         """Draw periodic Gaussian noise, mean 0, variance 1, correlation exp(−x²/4 length_x² − …), (N_y, N_x)."""
         rows, columns = self.heights.shape
         q_x = np.fft.rfftfreq(columns, self.pixel[0])
@@ -126,7 +125,7 @@ class Canvas:
         field = np.fft.irfft2(np.fft.rfft2(rng.standard_normal((rows, columns))) * filter_, s=(rows, columns))
         return field / field.std()
 
-    def at(self, field: Array, x: float, y: float) -> float:
+    def at(self, field: Real, x: float, y: float) -> float:
         """Return the value of a field at a position, µm, wrapped."""
         rows, columns = field.shape
         return field[int(y / self.pixel[1]) % rows, int(x / self.pixel[0]) % columns]
@@ -137,6 +136,6 @@ class Canvas:
         return HeightField(heights / heights.max() * depth, self.pixel, source)
 
 
-def smooth_step(x: Array, width: float) -> Array:
+def smooth_step(x: Real, width: float) -> Real:
     """Return a smooth step from 0 to 1 at x = 0."""
     return (1 + erf(x / width)) / 2

@@ -16,16 +16,14 @@ from functools import cached_property
 from itertools import chain
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy import ndimage
 from scipy.fft import fft2
 from scipy.special import gammainccinv, gammaincinv
 
+from ..array_types import Real
 from ..errors import check_whole
 from ..settings import ScalarSettings
 from .heightfield import HeightField, harmonic_fill
-
-Array = NDArray[np.float64]
 
 _MIN_WAVES = 2.5  # across the window, so that the peaks at q and −q do not overlap
 _LOBE_RADIUS = 2.5  # of a peak, bins: a Hann window has no power further away
@@ -63,7 +61,7 @@ class Period:
     strength: float
 
     @property
-    def q(self) -> Array:
+    def q(self) -> Real:
         """The wave vector, (2,), cycles/µm."""
         phi = np.deg2rad(self.direction)
         return np.array([np.cos(phi), np.sin(phi)]) / self.period
@@ -74,7 +72,7 @@ class Period:
         return f"{with_uncertainty(self.period, self.period_uncertainty)} µm along {direction}° from x"
 
     @classmethod
-    def of(cls, q: Array, covariance: Array, strength: float) -> Period:
+    def of(cls, q: Real, covariance: Real, strength: float) -> Period:
         """Make a period from a frequency (2,) in cycles/µm and its covariance (2, 2)."""
         length = float(np.hypot(*q))
         along, across = q / length, np.array([-q[1], q[0]]) / length
@@ -152,7 +150,7 @@ def find_periods(height_field: HeightField, count: int = 2, *, extent: str = "sa
     return tuple(sorted(found, key=lambda period: -period.strength))
 
 
-def _period(q: Array, strength: float, corners: list[_Periodogram]) -> Period:
+def _period(q: Real, strength: float, corners: list[_Periodogram]) -> Period:
     """Return the period of a peak; its uncertainty is the spread over the corners, weighted by their powers."""
     summits, power = zip(*(corner.summit(q) for corner in corners), strict=True)
     weight = np.array(power) / max(sum(power), 1e-300)
@@ -160,7 +158,7 @@ def _period(q: Array, strength: float, corners: list[_Periodogram]) -> Period:
     return Period.of(q, (weight * apart.T) @ apart / max(1 - weight @ weight, 0.5), strength)
 
 
-def height_spectrum(height_field: HeightField, extent: str) -> tuple[Array, Array, float]:
+def height_spectrum(height_field: HeightField, extent: str) -> tuple[Real, Real, float]:
     """Compute the power spectrum of the heights: of a tile as it is, of a sample levelled and under a Hann window.
 
     Returns:
@@ -181,7 +179,7 @@ def height_spectrum(height_field: HeightField, extent: str) -> tuple[Array, Arra
 class _Periodogram:
     """The mean periodogram of equally large parts of a scan, and its significant peaks."""
 
-    def __init__(self, parts: list[Array], pixel_size: tuple[float, float], variance: float) -> None:
+    def __init__(self, parts: list[Real], pixel_size: tuple[float, float], variance: float) -> None:
         """Take the heights of the parts and the variance of the whole, µm and µm²."""
         shape = parts[0].shape
         window = hann(shape)
@@ -197,7 +195,7 @@ class _Periodogram:
         self._usable = ((x > 0) | ((x == 0) & (y > 0))) & (np.hypot(x, y) >= _MIN_WAVES)
 
     @cached_property
-    def _power(self) -> Array:
+    def _power(self) -> Real:
         return np.mean([np.abs(fft2(part, workers=2)) ** 2 for part in self._parts], axis=0)
 
     @cached_property
@@ -229,7 +227,7 @@ class _Periodogram:
         """The largest power of a peak relative to the threshold of significance; 0 without a peak."""
         return max(self._candidates.values(), default=0.0)
 
-    def peaks(self, max_waves: float = np.inf) -> Iterator[tuple[Array, float]]:
+    def peaks(self, max_waves: float = np.inf) -> Iterator[tuple[Real, float]]:
         """Yield the frequencies, cycles/µm, and strengths of peaks of at most so many waves, highest first."""
         for at in self._candidates:
             waves = self._fundamental(at)
@@ -243,7 +241,7 @@ class _Periodogram:
             if (strength := self._strength(q)) >= _MIN_STRENGTH:
                 yield q, strength
 
-    def _fundamental(self, at: tuple[int, int]) -> Array:
+    def _fundamental(self, at: tuple[int, int]) -> Real:
         """Return the waves across the parts of the longest period with this peak as third or second harmonic."""
         waves = self._waves[:, at[0], at[1]]
         near = [other for other in self._candidates if self._power[other] > _MIN_FUNDAMENTAL * self._power[at]]
@@ -256,12 +254,12 @@ class _Periodogram:
                 return np.asarray(others[np.argmin(miss)])
         return np.asarray(waves)
 
-    def _strength(self, q: Array) -> float:
+    def _strength(self, q: Real) -> float:
         """Return the fraction of the power in the lobes about q and −q."""
         away = np.hypot(*(self._waves - (q * self.size)[:, None, None]))
         return float(min(2 * self._power[away <= _LOBE_RADIUS].sum() / self._power.sum(), 1.0))
 
-    def summit(self, q: Array) -> tuple[Array, float]:
+    def summit(self, q: Real) -> tuple[Real, float]:
         """Return the maximum of the power near a frequency, at most one bin away, and the power there."""
         start, step = q, 0.5 / self.size
         for _ in range(4):
@@ -298,7 +296,7 @@ def repeated(tile: HeightField, times: int = _MAX_REPETITIONS) -> HeightField:
     return HeightField(np.tile(tile.heights, (times, times)), tile.pixel_size, tile.source)
 
 
-def _streak(line: Array, waves: Array, k: int, across: float, count: float) -> float:
+def _streak(line: Real, waves: Real, k: int, across: float, count: float) -> float:
     """Return the mean power of the streak in a row or column of a periodogram near index k, outside the lobe there."""
     # The band of an irregular skin is the wider the further it is from the centre.
     lobe = int(np.ceil(_LOBE_RADIUS))
@@ -312,7 +310,7 @@ def _streak(line: Array, waves: Array, k: int, across: float, count: float) -> f
     return float(quartile * count / gammaincinv(count, 0.25))
 
 
-def _background(waves: Array, power: Array, count: float, ratio: float) -> Array:
+def _background(waves: Real, power: Real, count: float, ratio: float) -> Real:
     """Return the mean power of noise from lower quartiles over frequencies of similar magnitude, by power laws.
 
     Args:
@@ -349,7 +347,7 @@ def _halves(count: int) -> list[slice]:
     )
 
 
-def levelled(heights: Array) -> Array:
+def levelled(heights: Real) -> Real:
     """Return heights about the quadratic surface that fits them best, (N_y, N_x)."""
     # Orthonormal polynomials along each axis, as far as the points determine them.
     y, x = (np.linalg.qr(np.vander(np.linspace(-1, 1, n), min(n, 3), increasing=True))[0] for n in heights.shape)
@@ -358,12 +356,12 @@ def levelled(heights: Array) -> Array:
     return np.asarray(heights - heights.mean() - y @ coefficients @ x.T)
 
 
-def hann(shape: tuple[int, int]) -> Array:
+def hann(shape: tuple[int, int]) -> Real:
     """Return the Hann window of a patch without its zeros, (N_y, N_x); one along an axis of a single pixel."""
     return np.outer(*(np.sin(np.pi * (np.arange(n) + 0.5) / n) ** 2 for n in shape))
 
 
-def _same_wave(one: Array, other: Array, orders: int = 1000) -> bool:
+def _same_wave(one: Real, other: Real, orders: int = 1000) -> bool:
     """Return whether two wave vectors belong to one period that varies, or to its harmonics up to some order."""
     short, long = sorted((np.hypot(*one), np.hypot(*other)))
     angle = np.degrees(np.arctan2(abs(one[0] * other[1] - one[1] * other[0]), abs(one @ other)))

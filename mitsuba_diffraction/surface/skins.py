@@ -7,7 +7,8 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.special import erf
 
-from .drawing import Array, Canvas, check_profile, generator, smooth_step
+from ..array_types import Real
+from .drawing import Canvas, check_profile, generator, smooth_step
 from .heightfield import HeightField
 
 
@@ -92,7 +93,7 @@ def _elaphe_tip(canvas: Canvas, rng: np.random.Generator, x_0: float, y_0: float
     canvas.heights[index] -= drop * smooth_step(s, 0.02) * np.exp(-np.maximum(s, 0) / 0.12) * np.exp(-((t / 0.42) ** 4))
 
 
-def _elaphe_granules(canvas: Canvas, granules: Array, rng: np.random.Generator, x_0: float, y_0: float) -> None:
+def _elaphe_granules(canvas: Canvas, granules: Real, rng: np.random.Generator, x_0: float, y_0: float) -> None:
     """Draw a few large granules and some small ones along the ridge of a finger; overlaps keep the higher one."""
     row_pitch, pitch = canvas.pitch
     for number, radius, height in ((rng.poisson(2.6), 0.12, 0.09), (rng.poisson(5.0), 0.055, 0.03)):

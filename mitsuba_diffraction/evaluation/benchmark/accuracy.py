@@ -8,6 +8,7 @@ import numpy as np
 import scipy.special
 from numpy.typing import NDArray
 
+from ...array_types import Real
 from ...bsdf.testing import direction
 from ...optics.color import daylight, delta_E, spectrum_to_XYZ
 from ...precomputation.grating_spectrum import GratingSpectrum
@@ -16,8 +17,6 @@ from ...spectrum.grids import OrderGrid
 from ...surface.heightfield import HeightField
 from ..record import Record
 from .cases import Case
-
-Array = NDArray[np.float64]
 
 _PATCHES = tuple(direction(np.array([30.0, -45.0, -15.0, -5.0, 10.0, 45.0, 60.0]), azimuth) for azimuth in (0.0, 90.0))
 """ω_i and six ω_o in each of the planes x and y: (7, 3)."""
@@ -109,7 +108,7 @@ class Exact:
         self.xyz = self._xyz(exact)
         """(12, 3) of the patches' S/λ² under D65; without K, G and R, which differ from patch to patch."""
 
-    def _xyz(self, s: Array) -> Array:
+    def _xyz(self, s: Real) -> Real:
         light = daylight(self._wavelengths) / (self._wavelengths * 1e-3) ** 2
         return spectrum_to_XYZ(s * light, self._wavelengths)
 
@@ -126,12 +125,12 @@ class Exact:
         return patch_difference(self.xyz, self._xyz(spectrum.evaluate(self._q, self._kappa)))
 
 
-def patch_difference(exact: Array, approximate: Array) -> tuple[float, float]:
+def patch_difference(exact: Real, approximate: Real) -> tuple[float, float]:
     """Return mean and maximum CIEDE2000 of XYZ (n, 3), exposed so that the brightest exact patch is a light grey."""
     difference = delta_E(*(xyz * 0.5 / exact[:, 1].max() for xyz in (exact, approximate)))
     return float(difference.mean()), float(difference.max())
 
 
-def patch_directions() -> tuple[Array, Array]:
+def patch_directions() -> tuple[Real, Real]:
     """Return ω_i and ω_o of the patches, (12, 3) each."""
     return np.repeat([plane[0] for plane in _PATCHES], 6, axis=0), np.concatenate([plane[1:] for plane in _PATCHES])

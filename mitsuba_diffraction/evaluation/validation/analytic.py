@@ -8,9 +8,9 @@ from __future__ import annotations
 from collections.abc import Callable
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.special import jv
 
+from ...array_types import Real
 from ...bsdf.testing import direction, towards
 from ...settings import lobe_width
 from ...surface import gratings
@@ -18,8 +18,6 @@ from ...surface.heightfield import HeightField
 from ..record import Check, Record
 from .conservation import parseval
 from .lobes import brdf, density, grating, k_g_between, order_powers_of_bsdf, orders_above, spectrum_of
-
-Array = NDArray[np.float64]
 
 MAX_ERROR = 1e-4
 _WAVELENGTHS = (0.42, 0.55, 0.68)  # µm
@@ -45,13 +43,13 @@ def compare_directions(height_field: HeightField, theta: float, phi: float) -> R
     return Record.at_max_error(expected, found, MAX_ERROR, f"{len(found)} orders, direction cosines")
 
 
-def _peaks(bsdf: object, wi: Array, wavelength: float, width: float) -> list[Array]:
+def _peaks(bsdf: object, wi: Real, wavelength: float, width: float) -> list[Real]:
     """Return centres (u, v) of all lobes, two lobe widths apart, at up to 70 degrees, by an exhaustive search.
 
     A centre is the mean of (u, v) weighted by f/(K G), which removes the variation of K G over a lobe.
     """
 
-    def evaluate(u: Array, v: Array) -> Array:
+    def evaluate(u: Real, v: Real) -> Real:
         return density(bsdf, wi, np.stack([u, v, np.sqrt(1 - u**2 - v**2)], axis=-1), wavelength)
 
     axis = np.arange(-1, 1, 2 * width)
@@ -76,7 +74,7 @@ def _peaks(bsdf: object, wi: Array, wavelength: float, width: float) -> list[Arr
 
 
 def compare_orders(
-    height_field: HeightField, closed_form: Callable[[Array, Array], Array], azimuth: float = 0.0
+    height_field: HeightField, closed_form: Callable[[Real, Real], Real], azimuth: float = 0.0
 ) -> Record:
     """Compare η_m of the orders at up to 80° with `closed_form`, which takes m (n, 2) and κ (n,)."""
     spectrum = spectrum_of(height_field, **NARROW_LOBES)
@@ -93,7 +91,7 @@ def compare_orders(
     return Record.at_max_error(wanted, powers, MAX_ERROR, f"{len(powers)} orders, 0 to 50°, 420 to 680 nm")
 
 
-def _binary(m: Array, kappa: Array, depth: float) -> Array:
+def _binary(m: Real, kappa: Real, depth: float) -> Real:
     """Return cos²(κd/2) for the specular order, (2/πm)² sin²(κd/2) for odd orders, zero for even ones; half duty."""
     odd = m[:, 0] % 2 == 1
     with np.errstate(divide="ignore"):
@@ -136,18 +134,18 @@ def _flat() -> Record:
 SINUSOID, BLAZE = gratings.sinusoidal(_PERIOD, 0.3), gratings.blazed(_PERIOD, 0.25, samples=2048)
 
 
-def sinusoid_orders(m: Array, kappa: Array) -> Array:
+def sinusoid_orders(m: Real, kappa: Real) -> Real:
     """Return J_m²(κ depth/2) (Jacobi–Anger)."""
     return jv(m[:, 0], kappa * 0.15) ** 2
 
 
-def blaze_orders(m: Array, kappa: Array) -> Array:
+def blaze_orders(m: Real, kappa: Real) -> Real:
     """Return sinc²(m − κ depth/2π)."""
     return np.sinc(m[:, 0] - kappa * 0.25 / (2 * np.pi)) ** 2
 
 
 def _crossed() -> Record:
-    def closed_form(m: Array, kappa: Array) -> Array:
+    def closed_form(m: Real, kappa: Real) -> Real:
         return (jv(m, kappa[:, None] * 0.075) ** 2).prod(axis=1)
 
     return compare_orders(gratings.crossed(2.0, 0.15, samples=64), closed_form)

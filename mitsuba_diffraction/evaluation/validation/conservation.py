@@ -7,8 +7,8 @@ from collections.abc import Callable
 
 import mitsuba as mi
 import numpy as np
-from numpy.typing import NDArray
 
+from ...array_types import Real
 from ...bsdf import testing
 from ...precomputation.grating_spectrum import GratingSpectrum
 from ...surface import gratings
@@ -16,21 +16,19 @@ from ...surface.heightfield import HeightField
 from ..record import Check, Record
 from .lobes import brdf, grating, spectrum_of
 
-Array = NDArray[np.float64]
-
 _WAVELENGTHS = (0.42, 0.55, 0.68)  # µm
 _ANGLES = (0.0, 30.0, 60.0, 80.0)  # degrees
 _MAX_DEVIATIONS = 4.0  # of averages of random samples
 _SAMPLES = 1 << 17
 
 
-def _drawn(bsdf: mi.BSDF, wi: Array, wavelength: float) -> tuple[Array, Array]:
+def _drawn(bsdf: mi.BSDF, wi: Real, wavelength: float) -> tuple[Real, Real]:
     """Draw ω_o (n, 3) for ω_i (n, 3); return them and their weights f cos θ_o / pdf (n,)."""
     wo, weights, _ = testing.sample(bsdf, wi, [1e3 * wavelength] * len(mi.UnpolarizedSpectrum(0)))
     return wo, weights[:, 0]
 
 
-def _near_orders(spectrum: GratingSpectrum, wavelength: float, count: int) -> tuple[Array, Array]:
+def _near_orders(spectrum: GratingSpectrum, wavelength: float, count: int) -> tuple[Real, Real]:
     """Return pairs of directions (count, 3), the second sampled by the BSDF for the first: near orders."""
     random = np.random.default_rng(3)
     cosine, phi = random.uniform(0.1, 1, count), random.uniform(0, 360, count)

@@ -21,6 +21,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from ...array_types import Real
 from ...bsdf.testing import direction
 from ...optics.geometry import Orders
 from ...scalar_theory.closed_form import efficiency_difference, profile_powers, scalar_orders, sinusoid_powers
@@ -29,8 +30,6 @@ from ...surface import gratings
 from ...surface.heightfield import HeightField
 from ..record import Check, Record
 from .lobes import grating, lobe_powers, spectrum_of
-
-Array = NDArray[np.float64]
 
 STORED = Path(__file__).parents[2] / "data" / "rigorous.json"
 BOUNDS = {"sinusoidal": 0.02, "blazed": 0.1, "triangular": 0.1}
@@ -73,12 +72,12 @@ class RigorousResult:
     material: str
     index: complex
     orders: NDArray[np.int64]
-    te: Array
-    tm: Array
+    te: Real
+    tm: Real
     change: float
 
     @property
-    def unpolarised(self) -> Array:
+    def unpolarised(self) -> Real:
         """Mean of `te` and `tm`, (n,)."""
         return (self.te + self.tm) / 2
 
@@ -99,7 +98,7 @@ class RigorousResult:
         powers = profile_powers(SOLVED_PROFILES[self.profile](self.period, self.depth))
         return scalar_orders(powers, self.period, self.wavelength, self.angle, self.index)
 
-    def found(self) -> Array:
+    def found(self) -> Real:
         """Return the efficiencies of the BSDF, (n,)."""
         spectrum, bsdf = _plugin(self.profile, self.period, self.depth, self.material)
         q = np.stack([self.orders / self.period, np.zeros(len(self.orders))], axis=-1)
@@ -164,7 +163,7 @@ def formula(those: Iterable[RigorousResult]) -> Record:
     return Record(np.max(differences), 0.0, 2e-2, note=note)
 
 
-def polarised_fractions(case: RigorousResult) -> tuple[Array, Array, Array]:
+def polarised_fractions(case: RigorousResult) -> tuple[Real, Real, Real]:
     """Return η_te/(η_te + η_tm), rigorous and by R_s and R_p at the half vector, and the fraction of power in each."""
     orders = case.scalar()
     total = case.te + case.tm

@@ -10,16 +10,15 @@ from typing import Any, cast
 
 import mitsuba as mi
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
+from ...array_types import Real
 from ...bsdf import testing
 from ...optics.geometry import k_g
 from ...precomputation.grating_spectrum import GratingSpectrum
 from ...precomputation.spectra import precompute
 from ...spectrum.grids import OrderGrid
 from ...surface.heightfield import HeightField
-
-Array = NDArray[np.float64]
 
 _TOLERANCE = 1e-5
 """Of the spectra, so that an analytic check to 1e-4 measures the model, not its tables."""
@@ -48,25 +47,25 @@ def spectrum_of(height_field: HeightField, **settings: Any) -> GratingSpectrum:
     return _built(height_field, tuple(sorted({"tolerance": _TOLERANCE, **settings}.items())))
 
 
-def k_g_between(wi: ArrayLike, wo: ArrayLike, shadowing: bool = True) -> Array:
+def k_g_between(wi: ArrayLike, wo: ArrayLike, shadowing: bool = True) -> Real:
     """Compute K G of unit vectors (..., 3) in the upper hemisphere; shapes broadcast."""
     wi, wo = np.asarray(wi, np.float64), np.asarray(wo, np.float64)
     return k_g(wi[..., 2], wo[..., 2], ((wi + wo)[..., :2] ** 2).sum(axis=-1), shadowing=shadowing)
 
 
-def brdf(bsdf: mi.BSDF, wi: ArrayLike, wo: ArrayLike, wavelength: float) -> Array:
+def brdf(bsdf: mi.BSDF, wi: ArrayLike, wo: ArrayLike, wavelength: float) -> Real:
     """Evaluate f [1/sr] at directions (..., 3); zero where ω_o is not above the surface."""
     value = testing.evaluate(bsdf, wi, wo, [1e3 * wavelength])[..., 0]
     cosine = np.broadcast_to(np.asarray(wo)[..., 2], value.shape)
     return np.divide(value, cosine, out=np.zeros_like(value), where=cosine > 0)
 
 
-def density(bsdf: mi.BSDF, wi: Array, wo: Array, wavelength: float) -> Array:
+def density(bsdf: mi.BSDF, wi: Real, wo: Real, wavelength: float) -> Real:
     """Evaluate S [µm²] by a perfect mirror without E: f λ²/(K G)."""
     return brdf(bsdf, wi, wo, wavelength) * wavelength**2 / k_g_between(wi, wo)
 
 
-def lobe_powers(bsdf: mi.BSDF, spectrum: GratingSpectrum, wi: Array, q: ArrayLike, wavelength: float) -> Array:
+def lobe_powers(bsdf: mi.BSDF, spectrum: GratingSpectrum, wi: Real, q: ArrayLike, wavelength: float) -> Real:
     """Integrate the fraction of the incident power reflected into the lobes about q: ∫ f cos θ_o dω_o = λ² ∫ f dq.
 
     By Gauss–Legendre quadrature over the square to which a lobe is truncated.
@@ -89,7 +88,7 @@ def lobe_powers(bsdf: mi.BSDF, spectrum: GratingSpectrum, wi: Array, q: ArrayLik
     return brdf(bsdf, wi, testing.towards(wi, points, 1e3 * wavelength), wavelength) @ area * wavelength**2
 
 
-def orders_above(spectrum: GratingSpectrum, wi: Array, wavelength: float) -> Array:
+def orders_above(spectrum: GratingSpectrum, wi: Real, wavelength: float) -> Real:
     """Return the orders m (n, 2) of a tile at up to 80° from the normal."""
     m_x, m_y = np.meshgrid(*spectrum.grid.axes())
     m = np.stack([m_x.ravel(), m_y.ravel()], axis=-1)
@@ -98,8 +97,8 @@ def orders_above(spectrum: GratingSpectrum, wi: Array, wavelength: float) -> Arr
 
 
 def order_powers_of_bsdf(
-    bsdf: mi.BSDF, spectrum: GratingSpectrum, wi: Array, m: Array, wavelength: float
-) -> tuple[Array, Array]:
+    bsdf: mi.BSDF, spectrum: GratingSpectrum, wi: Real, m: Real, wavelength: float
+) -> tuple[Real, Real]:
     """Return η_m (n,) of the orders m (n, 2) by the BSDF (the power of their lobes without K and G), and their κ."""
     q = m / np.asarray(cast(OrderGrid, spectrum.grid).tile_size)
     wo = testing.towards(wi, q, 1e3 * wavelength)

@@ -11,15 +11,13 @@ import json
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 
+from ...array_types import Real
 from ...rigorous.solver import efficiencies
 from ...scalar_theory.closed_form import profile_powers, scalar_orders
 from ...settings import THEORIES
 from ...surface.gratings import right_angled
 from ..record import Check, Record
-
-Real = NDArray[np.float64]
 
 DATA = Path(__file__).parents[2] / "data" / "gratings"
 FITS = DATA / "fits.json"

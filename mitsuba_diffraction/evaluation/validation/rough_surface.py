@@ -21,17 +21,15 @@ import itertools
 
 import mitsuba as mi
 import numpy as np
-from numpy.typing import NDArray
 from scipy.special import gammaln, ndtr
 
+from ...array_types import Real
 from ...bsdf.testing import direction, towards
 from ...precomputation.grating_spectrum import GratingSpectrum
 from ...settings import lobe_width
 from ...surface.heightfield import HeightField
 from ..record import Check, Record
 from .lobes import brdf, density, grating, spectrum_of
-
-Array = NDArray[np.float64]
 
 PROFILE_LENGTH = 8_000.0  # µm of profile
 PIXEL = 0.135  # µm: resolves all frequencies at the angles of SETTINGS
@@ -54,7 +52,7 @@ def random_profile(rms: float, correlation: float) -> HeightField:
     )
 
 
-def diffuse(q: Array, g: float, correlation: float, broadened: float = 0.0, even: bool = False) -> Array:
+def diffuse(q: Real, g: float, correlation: float, broadened: float = 0.0, even: bool = False) -> Real:
     """Compute the diffuse component of S in µm, convolved with a lobe of σ_q = `broadened`; q (...) in cycles/µm."""
     n = np.arange(2 if even else 1, int(g + 12 * np.sqrt(g) + 20), 2 if even else 1)
     weight = np.exp(n * np.log(g) - g - gammaln(n + 1))

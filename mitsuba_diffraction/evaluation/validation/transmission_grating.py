@@ -10,8 +10,8 @@ from __future__ import annotations
 import functools
 
 import numpy as np
-from numpy.typing import NDArray
 
+from ...array_types import Real
 from ...optics.geometry import fresnel
 from ...rigorous.solver import efficiencies
 from ...scalar_theory.closed_form import profile_powers, transmitted_orders
@@ -20,8 +20,6 @@ from ...surface.gratings import blazed, right_angled
 from ...surface.heightfield import HeightField
 from ..record import Check, Record
 from .measured_gratings import best_factor, measured, rms_difference, stored_angles
-
-Real = NDArray[np.float64]
 
 T300_PERIOD = 1000 / 300
 GROOVES = ("right-angled", "vertical wall")
