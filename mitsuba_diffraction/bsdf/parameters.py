@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
+from functools import cached_property
 from pathlib import Path
 from typing import Any
 
@@ -446,11 +447,15 @@ class GratingRequest:
     @property
     def known(self) -> tuple[KnownRange, ...]:
         """Where each index that the scene names is known."""
-        known = *self.media.known, *self.material.known()
+        return *self.media.known, *self.material.known(), *self._known_of_recipe
+
+    @cached_property
+    def _known_of_recipe(self) -> tuple[KnownRange, ...]:
+        """Where the index of a rigorous recipe is known: once, as its file may be gone when a kernel is traced."""
         settings = self.surface.settings if isinstance(self.surface, Recipe) else None
         if isinstance(settings, RigorousSettings) and settings.material:
-            return *known, index_of("material", settings.material).known("material")
-        return known
+            return (index_of("material", settings.material).known("material"),)
+        return ()
 
     def widened(self, wavelengths: tuple[float, float]) -> Recipe | None:
         """Return the recipe for light of these wavelengths in air, nm; None for one that sets its own, or a file."""
