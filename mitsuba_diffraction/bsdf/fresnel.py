@@ -20,7 +20,7 @@ Cosines: TypeAlias = "mi.Float | mi.UnpolarizedSpectrum"
 
 
 class Material:
-    """The reflectance of a material, from `__call__` or `powers`; by default it has no index and no parameters.
+    """The reflectance of a material, from `__call__` or `r_and_t`; by default it has no index and no parameters.
 
     Indices are relative to that of the medium above in the middle of visible light, but for those that methods return,
     which are relative to it at each wavelength. `cos_half` may be one cosine for each wavelength.
@@ -43,9 +43,9 @@ class Material:
 
     def __call__(self, si: mi.SurfaceInteraction3f, cos_half: Cosines, active: mi.Bool) -> mi.UnpolarizedSpectrum:
         """Return R at the cosine ω_i·h, negative for light from below."""
-        return self.powers(si, cos_half, active)[0]
+        return self.r_and_t(si, cos_half, active)[0]
 
-    def powers(
+    def r_and_t(
         self, si: mi.SurfaceInteraction3f, cos_half: Cosines, active: mi.Bool
     ) -> tuple[mi.UnpolarizedSpectrum, mi.UnpolarizedSpectrum]:
         """Return R, and T of a transparent material, at the cosine ω_i·h."""

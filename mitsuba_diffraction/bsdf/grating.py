@@ -337,18 +337,18 @@ class Grating:
 
     def transmittance(self, si: mi.SurfaceInteraction3f, cos: mi.Float, active: mi.Bool) -> mi.UnpolarizedSpectrum:
         """Return T of a plane, times T of the coat, at the cosine of an angle outside."""
-        transmitted = self._powers(si, cos, active)[1]
+        transmitted = self._r_and_t(si, cos, active)[1]
         return transmitted if self.coat is None else (1 - self.coat.reflectance(si, cos)) * transmitted
 
     def reflectance(self, si: mi.SurfaceInteraction3f, cos: mi.Float, active: mi.Bool) -> mi.UnpolarizedSpectrum:
         """Return R of a plane below the coat, at the cosine of an angle outside."""
-        return self._powers(si, cos, active)[0]
+        return self._r_and_t(si, cos, active)[0]
 
-    def _powers(
+    def _r_and_t(
         self, si: mi.SurfaceInteraction3f, cos: mi.Float, active: mi.Bool
     ) -> tuple[mi.UnpolarizedSpectrum, mi.UnpolarizedSpectrum]:
         _, si = self._covered(si)
-        return self.theory.material.powers(si, cos if self.coat is None else self.coat.cos_inside(si, cos), active)
+        return self.theory.material.r_and_t(si, cos if self.coat is None else self.coat.cos_inside(si, cos), active)
 
     def sample(
         self,

@@ -17,7 +17,7 @@ MIN_LAYER_PROBABILITY = 0.1  # of sampling the grating, and its base, as their p
 
 
 @dataclass(frozen=True)
-class Request:
+class RequestedComponents:
     """The components requested by a context.
 
     Attributes:
@@ -86,48 +86,50 @@ class Layers:
             self.base.check()
         self.grating.parameters_changed(keys)
 
-    def _request(self, ctx: mi.BSDFContext) -> Request:
-        return Request(
+    def _requested(self, ctx: mi.BSDFContext) -> RequestedComponents:
+        return RequestedComponents(
             ctx.is_enabled(mi.BSDFFlags.GlossyReflection, 0),
             self.interface.transmits and ctx.is_enabled(mi.BSDFFlags.GlossyTransmission, 1),
             len(self.components) > self.face and ctx.is_enabled(mi.BSDFFlags.DeltaReflection, self.face),
             None if self.base is None else self.base.context(ctx),
         )
 
-    def _transmission_probability(self, si: mi.SurfaceInteraction3f, request: Request) -> mi.Float:
+    def _transmission_probability(self, si: mi.SurfaceInteraction3f, requested: RequestedComponents) -> mi.Float:
         """Return the probability that a sample of the grating is transmitted, about its transmitted fraction."""
-        if not request.transmission or not request.reflection:
-            return mi.Float(1.0 if request.transmission else 0.0)
+        if not requested.transmission or not requested.reflection:
+            return mi.Float(1.0 if requested.transmission else 0.0)
         return dr.detach(self.interface.transmission_probability(rotated(si.wi, *self.grating.frame(si, True))))
 
     def _grating_probability(
         self,
         si: mi.SurfaceInteraction3f,
-        request: Request,
+        requested: RequestedComponents,
         transmittance: mi.UnpolarizedSpectrum | None,
         active: mi.Bool,
     ) -> mi.Float:
         """Return the probability of sampling the grating instead of the base, about its fraction of the power."""
-        if not request.grating or request.base is None:
-            return mi.Float(1.0 if request.grating else 0.0)
+        if not requested.grating or requested.base is None:
+            return mi.Float(1.0 if requested.grating else 0.0)
         entered = dr.mean(transmittance)
         reflected = 1 - entered
         assert self.base is not None
         returned = entered * self.base.albedo(si, active)
         return dr.detach(dr.clip(reflected / (reflected + returned), MIN_LAYER_PROBABILITY, 1 - MIN_LAYER_PROBABILITY))
 
-    def _face_probability(self, si: mi.SurfaceInteraction3f, request: Request, active: mi.Bool) -> mi.Float:
+    def _face_probability(
+        self, si: mi.SurfaceInteraction3f, requested: RequestedComponents, active: mi.Bool
+    ) -> mi.Float:
         """Return the probability of sampling the smooth face, about its fraction of the power."""
-        if not request.face:
+        if not requested.face:
             return mi.Float(0.0)
         cos = mi.Frame3f.cos_theta(si.wi)
-        rest = request.grating or request.base is not None
+        rest = requested.grating or requested.base is not None
         if self.coat is None:
             return dr.select(cos < 0, dr.detach(dr.mean(self._face(si))) if rest else mi.Float(1.0), 0)
         if not rest:
             return mi.Float(1.0)
         reflected = self.grating.reflectance(si, cos, active)
-        if request.base is not None and self.base is not None:
+        if requested.base is not None and self.base is not None:
             reflected += (1 - reflected) * self.base.albedo(si, active)
         front = dr.mean(self.coat.reflectance(si, cos))
         return dr.detach(dr.clip(front / (front + dr.square(1 - front) * dr.mean(reflected)), 0, 1))
@@ -171,22 +173,22 @@ class Layers:
     ) -> tuple[mi.Spectrum, mi.Float]:
         """Evaluate f cos θ_o and the density, as `mi.BSDF.eval_pdf`; for `wo_is_sample` see `Grating.evaluate`."""
         cos_i, cos_o = mi.Frame3f.cos_theta(si.wi), mi.Frame3f.cos_theta(wo)
-        request = self._request(ctx)
+        requested = self._requested(ctx)
         active = active & self.interface.is_incident(cos_i) & self.interface.is_incident(cos_o)
-        if request.reflection != request.transmission and self.interface.transmits:
-            active = active & ((cos_i * cos_o > 0) == request.reflection)
+        if requested.reflection != requested.transmission and self.interface.transmits:
+            active = active & ((cos_i * cos_o > 0) == requested.reflection)
         value, pdf = mi.Spectrum(0.0), mi.Float(0.0)
-        if request.grating:
-            p_transmission = self._transmission_probability(si, request)
+        if requested.grating:
+            p_transmission = self._transmission_probability(si, requested)
             of_grating, pdf = self.grating.evaluate(si, wo, active, wo_is_sample, p_transmission)
             value = self.grating.mueller(of_grating, ctx, si, wo, active)
-        if request.base is not None and self.base is not None:
+        if requested.base is not None and self.base is not None:
             transmittance = self.grating.transmittance(si, cos_i, active)
-            p_grating = self._grating_probability(si, request, transmittance, active)
-            of_base, density = self.base.bsdf.eval_pdf(request.base, si, wo, active)
+            p_grating = self._grating_probability(si, requested, transmittance, active)
+            of_base, density = self.base.bsdf.eval_pdf(requested.base, si, wo, active)
             value += _attenuated(transmittance * self.grating.transmittance(si, cos_o, active), of_base)
             pdf = p_grating * pdf + (1 - p_grating) * density
-        pdf *= 1 - self._face_probability(si, request, active)
+        pdf *= 1 - self._face_probability(si, requested, active)
         return dr.select(active, value, 0), dr.select(active, pdf, 0)
 
     def sample(
@@ -194,17 +196,17 @@ class Layers:
     ) -> tuple[mi.BSDFSample3f, mi.Spectrum]:
         """Draw a direction, as `mi.BSDF.sample`."""
         active = active & self.interface.is_incident(mi.Frame3f.cos_theta(si.wi))
-        request = self._request(ctx)
+        requested = self._requested(ctx)
         bs, result = dr.zeros(mi.BSDFSample3f), mi.Spectrum(0.0)
         bs.eta = 1.0
-        p_face = self._face_probability(si, request, active)
+        p_face = self._face_probability(si, requested, active)
         of_face = active & (sample1 < p_face)
-        if request.grating or request.base is not None:
+        if requested.grating or requested.base is not None:
             # The face reflects all light from below and at the horizon.
             complement = dr.select(p_face < 1, 1 - p_face, 1)
             rest = smaller((sample1 - p_face) / complement, BELOW_ONE)
-            bs, result = self._sample_below(ctx, si, request, 1 - p_face, rest, sample2, active & (sample1 >= p_face))
-        if request.face:
+            bs, result = self._sample_below(ctx, si, requested, 1 - p_face, rest, sample2, active & (sample1 >= p_face))
+        if requested.face:
             bs.wo = dr.select(of_face, mi.reflect(si.wi), bs.wo)
             bs.pdf = dr.select(of_face, p_face, bs.pdf)
             bs.eta = dr.select(of_face, 1, bs.eta)
@@ -231,26 +233,26 @@ class Layers:
         self,
         ctx: mi.BSDFContext,
         si: mi.SurfaceInteraction3f,
-        request: Request,
+        requested: RequestedComponents,
         probability: mi.Float,
         sample1: mi.Float,
         sample2: mi.Point2f,
         active: mi.Bool,
     ) -> tuple[mi.BSDFSample3f, mi.Spectrum]:
         """Draw a direction from the grating or its base; the face is not sampled with the probability `probability`."""
-        cos_i, base_context = mi.Frame3f.cos_theta(si.wi), request.base
+        cos_i, base_context = mi.Frame3f.cos_theta(si.wi), requested.base
         bs = dr.zeros(mi.BSDFSample3f)
         bs.eta = 1.0
         bs.sampled_type = mi.UInt32(+mi.BSDFFlags.GlossyReflection)
         transmittance = self.grating.transmittance(si, cos_i, active) if base_context is not None else None
-        p_grating = self._grating_probability(si, request, transmittance, active)
+        p_grating = self._grating_probability(si, requested, transmittance, active)
         of_base = active & (sample1 >= p_grating)
-        if request.grating:
-            p_transmission = self._transmission_probability(si, request)
+        if requested.grating:
+            p_transmission = self._transmission_probability(si, requested)
             bs.wo = self.grating.sample(
                 si, sample1 / p_grating, sample2, active & (sample1 < p_grating), p_transmission
             )
-        if request.transmission:
+        if requested.transmission:
             transmitted = bs.wo.z * cos_i < 0
             bs.sampled_type = dr.select(transmitted, mi.UInt32(+mi.BSDFFlags.GlossyTransmission), bs.sampled_type)
             bs.sampled_component = dr.select(transmitted, mi.UInt32(1), 0)

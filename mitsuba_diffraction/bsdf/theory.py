@@ -303,7 +303,7 @@ class ScalarTheory(Theory):
         return power, density
 
     def reflectance(self, si: mi.SurfaceInteraction3f, geometry: Geometry, active: mi.Bool) -> mi.UnpolarizedSpectrum:
-        return dr.select(geometry.reflects, *self.material.powers(si, geometry.cos_half(), active))
+        return dr.select(geometry.reflects, *self.material.r_and_t(si, geometry.cos_half(), active))
 
     def split(
         self,

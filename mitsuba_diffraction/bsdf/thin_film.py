@@ -1,7 +1,7 @@
 """Thin films on the relief: zinc sulphide of a hologram, the oxide of anodised titanium, the stack of a beetle.
 
 R and T of a plane under the films follow from the characteristic matrices of `../optics/film_stack.py`, which E and
-samplers use as well (`film_stack.powers`: what changes |r|² or |t|² here changes it there). Films are evaluated by a
+samplers use as well (`film_stack.r_and_t`: what changes |r|² or |t|² here changes it there). Films are evaluated by a
 loop over a table of their indices, whose length is opaque; one film without the loop.
 """
 
@@ -335,7 +335,7 @@ class FilmedMaterial(Material):
             return mi.Float(1.0), n_s
         return dr.select(cos < 0, n_s.real, 1), mi.Complex2f(dr.select(cos < 0, 1, n_s.real), 0)
 
-    def powers(
+    def r_and_t(
         self, si: mi.SurfaceInteraction3f, cos_half: Cosines, active: mi.Bool
     ) -> tuple[mi.UnpolarizedSpectrum, mi.UnpolarizedSpectrum]:
         reflected, transmitted = [], []

@@ -53,7 +53,7 @@ def reflected_and_incident(field: tuple[AnyArray, AnyArray], y_0: AnyArray) -> t
     return y_0 * b - c, y_0 * b + c
 
 
-def powers(
+def r_and_t(
     cosine: Real, outside: complex, films: Sequence[tuple[complex, float]], below: complex
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     """Return R and T of s- and p-polarised light, (2, ...) each.
@@ -161,9 +161,9 @@ class Stack:
         for scale in scales:
             layers = [(n, scale * thickness / wavelength) for n, thickness in films]
             if side < 0:
-                of_side = powers(cosines, media[1], layers[::-1], media[0])
+                of_side = r_and_t(cosines, media[1], layers[::-1], media[0])
             else:
-                of_side = powers(cosines, media[0], layers, media[1])
+                of_side = r_and_t(cosines, media[0], layers, media[1])
             found.append(partial(_interpolated, cosines, *np.mean(of_side, axis=1)))
         return found
 

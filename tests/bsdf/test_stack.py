@@ -37,7 +37,7 @@ def test_r_and_t_in_numpy_are_those_of_transfer_matrices():
     for films, below, wavelength, angle in random_stacks(200):
         layers = [(n, 1e3 * d / wavelength) for n, d in films]
         for indices, cosine in (((1.0, layers, below), np.cos(angle)), ((below, layers[::-1], 1.0), 0.9)):
-            reflected, transmitted = film_stack.powers(np.array(cosine), *indices)
+            reflected, transmitted = film_stack.r_and_t(np.array(cosine), *indices)
             of_tmm = [
                 solved(pol, [(n, d * wavelength * 1e-3) for n, d in indices[1]], indices[2], wavelength, a, indices[0])
                 for pol, a in zip("sp", [np.arccos(cosine)] * 2, strict=True)
@@ -75,7 +75,7 @@ def test_r_and_t_in_a_scene_are_those_of_transfer_matrices(llvm, below):
 
 def powers_of(material, cosines, wavelengths):
     si = interaction([0, 0, 1], [[w] * 4 for w in wavelengths], len(wavelengths))
-    found = material.powers(si, floats(cosines), mi.Bool(True))
+    found = material.r_and_t(si, floats(cosines), mi.Bool(True))
     dr.eval(found)
     return [np.array(p)[0].astype(float) for p in found]
 
@@ -190,7 +190,7 @@ def test_thicknesses_are_updated_and_have_derivatives(llvm):
     def reflectance(thickness):
         parameters["thin_film_thickness"] = thickness
         parameters.update()
-        found = material_of(bsdf).powers(interaction([0, 0, 1], [[500.0] * 4]), mi.Float(0.9), mi.Bool(True))
+        found = material_of(bsdf).r_and_t(interaction([0, 0, 1], [[500.0] * 4]), mi.Float(0.9), mi.Bool(True))
         return found[0][0]
 
     thickness = mi.Float([0.05, 0.12] * 3)

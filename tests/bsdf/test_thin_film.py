@@ -72,7 +72,7 @@ def material_of(bsdf):
 def powers(bsdf, cosines, wavelengths):
     """R and T of the material, (n,), at cosines that are negative from below."""
     si = interaction([0, 0, 1], [[w] * 4 for w in wavelengths], len(wavelengths))
-    return [np.array(p)[0].astype(float) for p in material_of(bsdf).powers(si, floats(cosines), mi.Bool(True))]
+    return [np.array(p)[0].astype(float) for p in material_of(bsdf).r_and_t(si, floats(cosines), mi.Bool(True))]
 
 
 @pytest.mark.parametrize("below", ["dielectric", "metal"])
