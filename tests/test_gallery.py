@@ -69,7 +69,7 @@ def test_commands_come_from_the_pages(tmp_path):
 
 def test_every_picture_has_a_reference():
     models, renderings = gallery.commands(PAGES)
-    assert len(renderings) == 29
+    assert len(renderings) == 23
     assert {words[1] for words in models} == {
         f"scenes/{name}.py" for name in ("snake", "disc", "foil", "hologram", "anodised", "beetle", "ground")
     }

@@ -167,14 +167,15 @@ def hit(small_scenes, name, origins, directions):
 # ---------------------------------------------------------------- the hologram
 
 
-def test_stripes_of_the_hologram_diffract_their_colours_from_the_lamp_to_the_eye():
+@pytest.mark.parametrize("width", [16.0, 6.0])
+def test_stripes_of_the_hologram_diffract_their_colours_from_the_lamp_to_the_eye(width):
     """By the grating equation; as bright as they should be by J_1²."""
     light, eye = np.array(gratings_of.LIGHT), np.array(gratings_of.EYE)
     brightness = np.random.default_rng(0).random((4, 6, 3))
-    lateral, heights, turn = (x.ravel() for x in gratings_of.stripes(brightness))
-    pixel = gratings_of.SIZE[0] / 18
+    lateral, heights, turn = (x.ravel() for x in gratings_of.stripes(brightness, width))
+    pixel = width / 18
     y, x = np.mgrid[:4, :18]
-    points = np.stack([(x + 0.5) * pixel - 8, (1.5 - y) * 3 * pixel, 0 * x], -1).reshape(-1, 3)
+    points = np.stack([(x + 0.5) * pixel - width / 2, (1.5 - y) * 3 * pixel, 0 * x], -1).reshape(-1, 3)
     to_light, to_eye = (gratings_of.directions(points, there) for there in (light, eye))
     turn, wavelength = np.deg2rad(turn), np.tile(gratings_of.STRIPE_WAVELENGTHS, 24)
     diffracted = (wavelength / (lateral * gratings_of.PERIOD))[:, None] * np.stack([np.cos(turn), np.sin(turn)], -1)

@@ -49,15 +49,16 @@ def directions(points: Real, target: Real) -> Real:
     return offset / np.linalg.norm(offset, axis=-1, keepdims=True)
 
 
-def stripes(brightness: Real) -> tuple[Real, Real, Real]:
+def stripes(brightness: Real, width: float = SIZE[0]) -> tuple[Real, Real, Real]:
     """Return lateral scale, height scale and orientation in degrees of stripes, (rows, 3 columns) each.
 
     Args:
         brightness: (rows, columns, 3) of red, green and blue; row 0 is at the top.
+        width: of the hologram, cm.
     """
     rows, columns = brightness.shape[0], 3 * brightness.shape[1]
-    pixel = SIZE[0] / columns
-    x, y = (np.arange(columns) + 0.5) * pixel - SIZE[0] / 2, (rows / 2 - np.arange(rows) - 0.5) * 3 * pixel
+    pixel = width / columns
+    x, y = (np.arange(columns) + 0.5) * pixel - width / 2, (rows / 2 - np.arange(rows) - 0.5) * 3 * pixel
     points = np.stack([*np.meshgrid(x, y), np.zeros((rows, columns))], -1)
     cosines = -directions(points, np.array(LIGHT)) - directions(points, np.array(EYE))
     wavelength = np.tile(STRIPE_WAVELENGTHS, columns // 3)
@@ -100,9 +101,11 @@ def textures_in(folder: Path) -> list[Path]:
     return [folder / f"hologram_{name}.exr" for name in ("lateral", "heights", "turn")]
 
 
-def write(picture: str | os.PathLike[str], folder: Path, columns: int = 400) -> tuple[Real, Real, Real]:
-    """Write the textures of a picture, `columns` pixels wide, and return them; for errors see `fitted`."""
-    found = stripes(stripe_brightness(fitted(picture, columns)))
+def write(
+    picture: str | os.PathLike[str], folder: Path, columns: int = 400, width: float = SIZE[0]
+) -> tuple[Real, Real, Real]:
+    """Write the textures of a picture, `columns` pixels and `width` cm wide; return them. For errors see `fitted`."""
+    found = stripes(stripe_brightness(fitted(picture, columns)), width)
     header = {"type": OpenEXR.scanlineimage, "compression": OpenEXR.ZIP_COMPRESSION, "comments": MARK}
     for path, values in zip(textures_in(folder), found, strict=True):
         # The last row of a file is at v = 1 in Mitsuba, the top of the picture.

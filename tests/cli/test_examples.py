@@ -6,6 +6,7 @@ import shutil
 from pathlib import Path
 
 import numpy as np
+import OpenEXR
 import pytest
 from PIL import Image
 
@@ -84,6 +85,26 @@ def test_a_hologram_is_a_scene_with_its_textures(command, tmp_path, monkeypatch)
     Path("pre/hologram.xml").write_text("<scene/>")
     assert command("hologram me.png -o pre")[0] == 2
     assert not Path("pre/models").exists()
+
+
+def test_options_of_a_hologram_are_in_its_scene(command, tmp_path, monkeypatch):
+    """The camera sees a smaller hologram as large; its textures are computed for its size."""
+    monkeypatch.setattr(hologram, "render", lambda *_, **__: None)
+    monkeypatch.chdir(tmp_path)
+    Image.new("RGB", (32, 18), "red").save("me.png")
+    for name, options in (("a", ""), ("b", "--size 8 --tilt=-5 --material clear --lamp 1.5")):
+        assert command(f"hologram me.png -o {name} {options}")[0] == 0
+    one, other = (
+        dict(re.findall(r'<default name="(\w+)" value="(.*?)"', Path(x, "hologram.xml").read_text())) for x in "ab"
+    )
+    assert {name: float(one[name]) for name in ("size", "tilt", "lamp")} == {"size": 16, "tilt": 0, "lamp": 0.8}
+    assert (one["card"], other["card"]) == ("foil", "clear")
+    assert {name: float(other[name]) for name in ("size", "tilt", "lamp")} == {"size": 8, "tilt": -5, "lamp": 1.5}
+    seen = [np.tan(np.deg2rad(float(found["fov"]) / 2)) / float(found["size"]) for found in (one, other)]
+    assert seen[0] == pytest.approx(seen[1], rel=1e-3)
+    periods = [OpenEXR.File(str(of_picture.textures_in(Path(x, "models"))[0])).channels()["Y"].pixels for x in "ab"]
+    assert np.ptp(periods[1]) < 0.7 * np.ptp(periods[0])
+    assert command("hologram me.png -o c --size 100")[0] == 2
 
 
 def test_a_hologram_reads_pictures_as_design_does(tmp_path):
