@@ -167,7 +167,7 @@ class Change:
     tip_radius: float = float("nan")
 
 
-class _View(NamedTuple):
+class _AtNormalIncidence(NamedTuple):
     """A surface at normal incidence: its spectrum, its main period and the direction of that, and how it is scaled."""
 
     spectrum: GratingSpectrum
@@ -204,14 +204,14 @@ def changes(
     wavelengths from 360 nm/1.05.
     """
     angles = {m: angle for m in ORDERS if (angle := order_angle(m, main.period, GREEN)) is not None}
-    before = _View(spectrum, main.direction, main.period)
+    before = _AtNormalIncidence(spectrum, main.direction, main.period)
     views = {m: max((angle, -angle), key=lambda theta_o: before.XYZ(theta_o)[1]) for m, angle in angles.items()}
     fractions = {m: before.fraction(m) for m in views}
     colours = {m: before.XYZ(theta_o) for m, theta_o in views.items()}
     brightest = max((XYZ[1] for XYZ in colours.values()), default=1.0)
     exposure = 0.5 / brightest if brightest > 0 else 1.0
 
-    def change(what: str, by: float, after: _View, tip_radius: float = float("nan")) -> Change:
+    def change(what: str, by: float, after: _AtNormalIncidence, tip_radius: float = float("nan")) -> Change:
         new_fractions = {m: after.fraction(m) for m in views}
         colour = {m: float(delta_E(exposure * colours[m], exposure * after.XYZ(views[m]))) for m in views}
         return Change(what, by, after.period / main.period - 1, fractions, new_fractions, colour, tip_radius)

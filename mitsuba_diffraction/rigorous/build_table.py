@@ -124,12 +124,12 @@ def build_rigorous(
         )
     with one_thread():
         with stage("reference solutions"):
-            surface = _Surface(height_field, settings, tolerance)
+            surface = _SolvedSurface(height_field, settings, tolerance)
             checks = surface.checks()
         steps = SOLVED_STEPS if settings.transmission == "none" else SOLVED_STEPS_TRANSMISSION
         for number, solved in enumerate(steps, 1):
             with stage(f"table {number} of at most {len(steps)}"):
-                build = _Build(surface, solved, settings.polarised)
+                build = _CoarseSolver(surface, solved, settings.polarised)
                 values, mueller = build.table(progress, checkpoints)
             spectrum = RigorousSpectrum(
                 axes=build.axes,
@@ -157,7 +157,7 @@ def build_rigorous(
     return spectrum
 
 
-class _Surface:
+class _SolvedSurface:
     """A surface, its material and the solver for them.
 
     Attributes:
@@ -316,14 +316,14 @@ def _errors(spectrum: RigorousSpectrum, checks: list[_Check]) -> dict[str, Any]:
     }
 
 
-class _Build:
+class _CoarseSolver:
     """Solver on a coarser grid than `Axes`, for all orders of light from above and below together.
 
     The fields above depend on a and γ alone, the fields below on a and γ'. Each is the solution of one eigenproblem,
     which takes most of the time. With transmission a lattice of γ and one of γ' serve all of their pairs.
     """
 
-    def __init__(self, surface: _Surface, steps: tuple[int, int, int], polarised: bool) -> None:
+    def __init__(self, surface: _SolvedSurface, steps: tuple[int, int, int], polarised: bool) -> None:
         self.surface, self.steps = surface, steps
         self.entries = 4 if polarised else 1  # rows and columns of the matrices that are kept
         self.transmits = surface.transmission != "none"

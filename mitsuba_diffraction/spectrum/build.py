@@ -40,7 +40,7 @@ _SPLINE_ERROR, _MAX_SPACING = 0.017, 0.74
 _SERIES_FRACTION = 0.7  # by which a series of the amplitude is truncated
 # The error is measured at as many κ as this number of Fourier transforms allows, but at least at `_MIN_MEASURED`.
 _MAX_TRANSFORMS, _MIN_MEASURED = 400, 8
-_MEASURED_FRACTION = 0.95  # of the maximum error over κ: that of those measured, but see `_Build._measured`
+_MEASURED_FRACTION = 0.95  # of the maximum error over κ: that of those measured, but see `_TableBuilder._measured`
 _MAX_UNPACKED_NODES = 2_000  # up to which the nodes of one κ fit unpacked into the first-level cache
 MAX_TABLE_BYTES = 4e9
 
@@ -86,7 +86,7 @@ def build_power_spectrum(patches: Sequence[HeightField], settings: ScalarSetting
                 stacklevel=4,
             )
         powers = SamplePowers(height_field, effective, _spline_spacing(tolerance, lobe_width(effective)), max_frequency)
-    build = _Build(powers, height_range, max_kappa, tolerance - tail, progress)
+    build = _TableBuilder(powers, height_range, max_kappa, tolerance - tail, progress)
     table: SliceTable | AmplitudeTable
     table, error = build.series(height_field.heights, settings) if series else build()
     source, source_digest = height_field.source, height_field.digest
@@ -168,7 +168,7 @@ _STORAGES = (
 )
 
 
-class _Build:
+class _TableBuilder:
     """Builder of a table that keeps the tolerance, from exact powers.
 
     Attributes:

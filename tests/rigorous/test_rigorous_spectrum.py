@@ -203,7 +203,7 @@ def test_transmitted_efficiencies_are_reciprocal(glass, cosine, turn, side, wave
 def test_matrices_of_reversed_light_agree_with_the_solver(glass, monkeypatch):
     """The table does not store light from below to above; the sheet has its own closed sum for it."""
     monkeypatch.setattr("mitsuba_diffraction.rigorous.build_table.CHECK_COUNT", 30)
-    surface = build_table._Surface(SURFACE, replace(REQUEST, transmission=glass.transmission), 0.2)
+    surface = build_table._SolvedSurface(SURFACE, replace(REQUEST, transmission=glass.transmission), 0.2)
     errors = []
     for alpha, g, wavelength, near, orders in surface.checks():
         if (1, 0) in orders and not near:
@@ -216,7 +216,9 @@ def test_matrices_of_reversed_light_agree_with_the_solver(glass, monkeypatch):
 
 def test_a_sheet_with_a_flat_grating_is_a_plate():
     """With all internal reflections T = (1 − R)/(1 + R) for each polarisation, and R + T = 1."""
-    flat = build_table._Surface(gratings.blazed(0.3, 0.0, samples=64), replace(REQUEST, transmission="sheet"), 0.01)
+    flat = build_table._SolvedSurface(
+        gratings.blazed(0.3, 0.0, samples=64), replace(REQUEST, transmission="sheet"), 0.01
+    )
     k_0, alpha, k_y = 0.3 / 0.45, 0.3, 0.35
     square = k_0**2 - k_y**2
     (solved,) = flat.solve(alpha, square, [flat.light(square, 0.45)])
@@ -232,7 +234,7 @@ def test_a_sheet_with_a_flat_grating_is_a_plate():
 @pytest.mark.parametrize("transmission", ["interface", "sheet"])
 def test_nodes_of_imaginary_k_y_continue_fresnels_formulas(transmission):
     """Where γ > ν: Fresnel's formulas in β alone, which are real there, too; likewise for a plate."""
-    flat = build_table._Surface(
+    flat = build_table._SolvedSurface(
         gratings.blazed(0.3, 0.0, samples=64), replace(REQUEST, transmission=transmission), 0.01
     )
     nu2, square, alpha = 0.4, 0.7, 0.5
@@ -325,10 +327,10 @@ def test_the_work_of_a_job_is_the_number_of_its_eigenproblems(transmission, monk
 
     fields = build_table.half_space
     monkeypatch.setattr(build_table, "half_space", counting)
-    monkeypatch.setattr(build_table._Surface.solve, "__defaults__", (0, counting))
+    monkeypatch.setattr(build_table._SolvedSurface.solve, "__defaults__", (0, counting))
     monkeypatch.setattr(build_table, "_PAIR_WORK", 0)
-    surface = build_table._Surface(SURFACE, replace(REQUEST, transmission=transmission), 0.2)
-    jobs = build_table._Build(surface, (3, 4, 3), polarised=False)
+    surface = build_table._SolvedSurface(SURFACE, replace(REQUEST, transmission=transmission), 0.2)
+    jobs = build_table._CoarseSolver(surface, (3, 4, 3), polarised=False)
     work, counted = jobs.work(), []
     for job in range(len(jobs.jobs)):
         solved.clear()
