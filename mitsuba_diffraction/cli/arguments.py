@@ -227,12 +227,18 @@ def recipe_of(source: Path, of_scan: dict[str, Any], settings: dict[str, Any], e
     return Recipe.load(source, **settings)
 
 
-def recipe_with(name: str, values: dict[str, Value], of_scan: dict[str, Any], of_spectrum: dict[str, Any]) -> Recipe:
-    """Return the recipe of a scan, of a profile, or in a file, with values of the profile or the scan.
+def recipe_with(context: typer.Context, name: str, values: dict[str, Value]) -> Recipe | None:
+    """Return the recipe of a scan, of a profile, or in a file, with values and options; None for a saved spectrum.
 
     Raises:
-        RequestError: if there is no such value.
+        RequestError: if there is no such value, or any with a saved spectrum (.exr).
     """
+    of_scan, given = options_of_scan(context), settings_of(context)
+    of_spectrum: dict[str, Any] = {key: given[key] for key in ("extent", "coherence_length") if key in given}
+    if Path(name).suffix.lower() == ".exr":
+        if options := ", ".join([*values, *of_scan, *of_spectrum]):
+            raise RequestError(f"{name}: got {options} with a saved spectrum, wanted the recipe or the scan itself")
+        return None
     if Path(name).suffix.lower() == ".toml":
         recipe = recipe_of(Path(name), of_scan, of_spectrum)
         return Recipe({**recipe.surface, **values}, recipe.settings, recipe.folder)

@@ -22,10 +22,8 @@ from .arguments import (
     angles_of,
     check_suffix,
     converted,
-    options_of_scan,
     parse_numbers,
     recipe_with,
-    settings_of,
     surface_of,
     takes_scan,
 )
@@ -68,13 +66,7 @@ def efficiency(
     """Compute how much light goes into each order of a grating, or each spectral peak of an irregular surface."""
     angles, wavelengths = angles_of("--angle", angle), parse_numbers("--wavelength", wavelength)
     name, values = surface_of(source)
-    of_scan, given = options_of_scan(context), settings_of(context)
-    of_spectrum: dict[str, Any] = {key: given[key] for key in ("extent", "coherence_length") if key in given}
-    recipe = None
-    if Path(name).suffix.lower() != ".exr":
-        recipe = recipe_with(name, values, of_scan, of_spectrum)
-    elif options := ", ".join([*values, *of_scan, *of_spectrum]):
-        raise RequestError(f"{name}: got {options} with a saved spectrum, wanted the recipe or the scan itself")
+    recipe = recipe_with(context, name, values)
     settings = ScalarSettings() if recipe is None else recipe.settings
     chosen = settings.chosen
     theory, transmission = theory or settings.theory, transmission or chosen.get("transmission", "none")

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from functools import partial
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated
 
 import typer
 
@@ -25,10 +25,8 @@ from .arguments import (
     angles_of,
     check_suffix,
     is_film,
-    options_of_scan,
     parse_numbers,
     recipe_with,
-    settings_of,
     surface_of,
     takes_scan,
 )
@@ -79,15 +77,9 @@ def export(
     check_suffix("-o", output, ".osl", *_RANGES)
     ranges = {"wavelength": wavelength, "angle": angle, "azimuth": azimuth}
     given = {key: text for key, text in ranges.items() if text is not None}
-    of_scan, settings = options_of_scan(context), settings_of(context)
-    of_spectrum: dict[str, Any] = {key: settings[key] for key in ("extent", "coherence_length") if key in settings}
     parameters = {key: values.pop(key) for key in _OF_MATERIAL if key in values}
     _refuse_parameters_of_scenes(values, output)
-    title, recipe = source.partition(",")[0], None
-    if Path(name).suffix.lower() != ".exr":
-        recipe = recipe_with(name, values, of_scan, of_spectrum)
-    elif options := ", ".join([*values, *of_scan, *of_spectrum]):
-        raise RequestError(f"{name}: got {options} with a saved spectrum, wanted the recipe or the scan itself")
+    title, recipe = source.partition(",")[0], recipe_with(context, name, values)
     check_outputs([Path(name), *(recipe.files if recipe else [])], [("-o", output)], overwrite=overwrite)
     if output.suffix.lower() == ".osl":
         if given:
