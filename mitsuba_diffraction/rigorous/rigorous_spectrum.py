@@ -290,7 +290,8 @@ class RigorousSpectrum:
         if not (same and self.axes.transmission == self.settings.transmission):
             raise RequestError(f"axes: got {self.axes}, wanted the wavelengths and the transmission of {self.settings}")
         if self.settings.polarised != (self.mueller is not None):
-            raise RequestError(f"mueller: got {self.mueller}, wanted it with polarised=True and without it with False")
+            got = "none" if self.mueller is None else str(self.mueller.shape)
+            raise RequestError(f"mueller: got {got}, wanted {'matrices' if self.settings.polarised else 'none'}")
         for name, wanted in (("values", self.axes.shape), ("mueller", (*self.axes.shape, 4, 4))):
             table = getattr(self, name)
             if table is not None and (table.shape != wanted or table.dtype != np.float32):
