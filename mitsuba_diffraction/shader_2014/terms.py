@@ -283,11 +283,6 @@ def _transforms(spectrum: GratingSpectrum) -> int:
     return table.values.shape[0] * table.values.shape[1] if isinstance(table, SliceTable) else len(table.terms)
 
 
-def affordable_transforms(fft: Method, evaluations: int) -> float:
-    """Return the number of FFTs, one for each κ, that take as long as so many evaluations of slices."""
-    return 4 * evaluations / fft.time_ratio
-
-
 def _spectra(case: Case, series: Sequence[SeriesErrors]) -> dict[tuple[str, int | None], GratingSpectrum]:
     """Return spectra by representation and number of terms: the numbers shown, and the one that `TOLERANCE` needs."""
     slices = case.spectrum(TOLERANCE)
