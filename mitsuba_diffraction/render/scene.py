@@ -71,8 +71,9 @@ def unwrap_integrators(state: mi.parser.ParserState) -> None:
 
 
 def replace_path(state: mi.parser.ParserState) -> None:
-    """Replace `path` by `diffraction_path` where that supports the scene: the same picture, with less noise of lamps seen in gratings and no white specks; deep
-    paths take up to three times as long (docs/speed.md).
+    """Replace `path` by `diffraction_path` where that supports the scene: the same picture.
+
+    It has less noise of lamps seen in gratings, and no white specks. Deep paths take up to three times as long.
     """
     unsupported = any("sample_border" in node.props for node in state.nodes)
     for node in state.nodes:
