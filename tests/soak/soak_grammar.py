@@ -285,7 +285,7 @@ def _file(medium):
 
 def table_that_ends(medium, low, high):
     """λ in µm and n + ik of a medium from `low` to `high` nm, in rows of half a nanometre."""
-    wavelengths = 1e-3 * np.append(np.arange(low, high, 0.5), high)
+    wavelengths = 1e-3 * np.append(np.arange(low, high - 0.25, 0.5), high)
     return wavelengths, index_of(medium, wavelengths)
 
 
