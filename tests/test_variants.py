@@ -71,6 +71,8 @@ def test_the_library_of_the_extra_is_found_under_each_of_its_names(monkeypatch, 
     info.mkdir()
     (info / "METADATA").write_text("Metadata-Version: 2.1\nName: llvm-nanobind\nVersion: 21\n")
     (info / "RECORD").write_text(f"llvm/__init__.abi3.so,,\nx.libs/libzstd-28866717.so.1.4.4,,\n{name},,\n")
+    (tmp_path / name).parent.mkdir()
+    (tmp_path / name).touch()  # newer versions of importlib.metadata list files that exist
     # In place of loading it, which the system of the wheel alone can do.
     monkeypatch.setattr(variants, "_library_version", lambda path: (21, 1, 6))
     monkeypatch.setattr(metadata, "distributions", functools.partial(metadata.distributions, path=[str(tmp_path)]))

@@ -14,7 +14,7 @@ import numpy as np
 import typer
 from numpy.typing import NDArray
 
-from ..errors import RequestError
+from ..errors import RequestError, is_number
 from ..files.writing import refuse_other_than_utf8
 from ..precomputation.recipe import Recipe, parameters_of_profile, source_named
 from ..progress import say
@@ -77,11 +77,17 @@ def surface_of(text: str) -> tuple[str, dict[str, Value]]:
     values: dict[str, Value] = {}
     for name, equals, value in (item.strip().partition("=") for item in items):
         if not (name and equals and value) or name in values:
-            raise RequestError(f"{text}: got {name + equals + value!r}, wanted name=value, each name once")
+            got = f"{text}: got {name + equals + value!r}"
+            raise RequestError(f"{got}, wanted name=value, each name once{_no_lists(name)}")
         values[name] = converted(value)
     if source in RENAMED:
         say("note", f"{source} is the measured skin; {RENAMED[source]} is a synthetic one")
     return source_named(source), values
+
+
+def _no_lists(name: str) -> str:
+    """Return what to do if a part of SURFACE is the end of a list or of a number with a decimal comma, or ""."""
+    return "; a number has a point, and a list of films stands in a scene" if is_number(converted(name)) else ""
 
 
 def is_scan(source: str) -> bool:

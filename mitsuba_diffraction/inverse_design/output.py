@@ -125,4 +125,4 @@ def _plot_efficiency(axes: Axes, design: Design) -> None:
         plotted = own.mean() * np.linspace(0.8, 1.2, 31)
     axes.plot(plotted, 100 * design.in_picture(design.efficiencies(plotted), plotted), color="black")
     axes.plot(own, 100 * design.in_picture(design.efficiency), "o", color="black", ms=4)
-    axes.set(title="light in the picture", xlabel="wavelength, nm", ylabel="% of what it can use", ylim=(0, 100))
+    axes.set(title="light in the picture", xlabel="wavelength, nm", ylabel="% of usable light", ylim=(0, 100))

@@ -100,6 +100,7 @@ def _remedy(design: Design, strokes: float | None, inverted: bool) -> str:
         return (
             f"its finest strokes are 1/{strokes:.0f} of it, and the plate resolves 1/{resolved:.0f}: "
             f"--detail {strokes:.0f}"
+            + ("" if plate.wavelengths.size == 1 else ", or the light of a laser, such as --wavelength 532")
         )
     return "use a picture of less detail"
 

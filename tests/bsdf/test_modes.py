@@ -48,11 +48,15 @@ def grating(surface, mode):
         # E, one table for each of these, is a factor of value and weight alike.
         parameters = {**parameters, "spectrum": spectrum(surface), "conserve_energy": False}
         return mi.load_dict({"type": "diffraction_grating", **parameters}), WAVELENGTHS
+
+    def changed(table, **settings):
+        return dataclasses.replace(table, settings=dataclasses.replace(table.settings, **settings))
+
     if "transmission" in parameters:
-        table = dataclasses.replace(coarse_glass(mode), coherence_length=12.0)
+        table = changed(coarse_glass(mode), coherence_length=12.0)
         parameters = {**parameters, "spectrum": table}
         return mi.load_dict({"type": "diffraction_grating", **parameters}), (405.0, 440.0, 470.0, 498.0)
-    table = dataclasses.replace(made_up(8.0), ext_ior=INDEX if mode == "coat" else 1.0)
+    table = changed(made_up(8.0), ext_ior=INDEX if mode == "coat" else 1.0)
     parameters = {key: value for key, value in parameters.items() if key != "material"}
     wavelengths = (600.0, 700.0, 800.0, 900.0) if mode == "coat" else WAVELENGTHS
     return mi.load_dict({"type": "diffraction_grating", "spectrum": table, **parameters}), wavelengths

@@ -246,7 +246,8 @@ def _as_micrometres(numbers: NDArray, height_range: float | None) -> NDArray[np.
         return numbers.astype(np.float64)
     if height_range is None:
         raise RequestError(
-            f"height_range: missing for {numbers.dtype} heights, wanted the height in µm from black to white"
+            f"height_range: missing for {numbers.dtype} heights, wanted the height in µm from black to white "
+            "(--height-range)"
         )
     if not (is_number(height_range) and height_range > 0):
         raise RequestError(f"height_range: got {height_range!r}, wanted a positive number in µm")
