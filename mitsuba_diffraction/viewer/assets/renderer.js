@@ -5,7 +5,7 @@ const R2 = [0.7548776662466927, 0.5698402909980532];  // steps of a two-dimensio
 const R4 = [0.8566748838545029, 0.733891856627126, 0.6287067210378087, 0.5385972572236101];  // of a four-dimensional one
 const POINTS = 4;  // of the light in a frame of resolved orders, at most
 const TILE_POINTS = 256;  // of a tile of 4 x 4 pixels in a frame, see shade.glsl
-const SMOOTH_FRAMES = 16;  // the first ones, which are shown smoothed over a tile, the last of them less and less
+const SMOOTH_FRAMES = 64;  // the first ones, which are shown smoothed over a tile, the second half less and less
 // Where the sequences of a frame begin, so that its points follow those of the frame before.
 const randomOf = (frame, points) => R4.map((step) => fraction(0.5 + points * frame * step));
 const smoothingOf = (frame) => Math.min(Math.max(2 - (2 * frame) / SMOOTH_FRAMES, 0), 1);
