@@ -37,7 +37,8 @@ MIN_REPORTED_SECONDS = 2.0  # of work before a log or a notebook shows progress
 _MIN_REPORTED_DURATION = 10.0  # s, of a command
 _UNITS_OF_BYTES = ("GB", 1e9), ("MB", 1e6), ("kB", 1e3)
 _IN_ASCII = {"−": "-", "–": "-", "→": "->", "≤": "<=", "≥": ">=", "±": "+-", "×": "x", "·": "*"}
-_IN_ASCII |= {"µ": "u", "°": " deg", "²": "^2", "…": "...", "λ": "lambda"}  # Unicode names λ a lamda
+_IN_ASCII |= {"µ": "u", "°": " deg", "²": "^2", "…": "...", "∫": "integral of "}
+_IN_ASCII |= {"λ": "lambda"}  # Unicode names it a lamda
 _lock = threading.Lock()
 _stages: list[str] = []  # nested blocks of code, the innermost last
 _durations: dict[str, float] = {}  # s, by the name of a stage
@@ -111,10 +112,12 @@ def adapt_streams() -> None:
 
 
 def _in_words(error: UnicodeError) -> tuple[str | bytes, int]:
-    """Return lambda for λ, - for −, and so on; an escape for other characters, such as in file names."""
+    """Return lambda for λ, ^6 for ⁶, - for −, and so on; an escape for other characters, such as in file names."""
     assert isinstance(error, UnicodeEncodeError)
     character = error.object[error.start]
-    if (text := _IN_ASCII.get(character)) is None:
+    if unicodedata.name(character, "").startswith("SUPERSCRIPT"):
+        text = "^" + unicodedata.normalize("NFKC", character).replace("−", "-")
+    elif (text := _IN_ASCII.get(character, "")) == "":
         kind, _, letter = unicodedata.name(character, "").partition(" LETTER ")
         if kind not in ("GREEK SMALL", "GREEK CAPITAL") or " " in letter:
             return codecs.backslashreplace_errors(error)

@@ -116,12 +116,20 @@ def in_cycles(shader, shape, light, samples, folder):
     return np.load(out)
 
 
-def path_traced(bsdf, shape, radius, spp):
-    """The same by `diffraction_path`, with a lamp."""
+def path_traced(bsdf, shape, light, spp):
+    """The same by `diffraction_path`, with a lamp of this radius or a "sky"."""
     import mitsuba as mi
 
     to = mi.ScalarTransform4f()
-    lamp = to.translate([0, -1, 3]).rotate([1, 0, 0], 180).scale(radius)
+    lights = {"sky": {"type": "constant", "radiance": {"type": "d65"}}}
+    if light != "sky":
+        lights = {
+            "lamp": {
+                "type": "disk",
+                "to_world": to.translate([0, -1, 3]).rotate([1, 0, 0], 180).scale(light),
+                "emitter": {"type": "area", "radiance": {"type": "d65", "scale": 100.0}},
+            }
+        }
     film = {"type": "hdrfilm", "width": SIZE, "height": SIZE, "rfilter": {"type": "box"}, "pixel_format": "rgb"}
     scene = mi.load_dict(
         {
@@ -134,11 +142,7 @@ def path_traced(bsdf, shape, radius, spp):
                 "film": film,
             },
             "shape": {"type": "sphere" if shape == "sphere" else "rectangle", "bsdf": bsdf},
-            "lamp": {
-                "type": "disk",
-                "to_world": lamp,
-                "emitter": {"type": "area", "radiance": {"type": "d65", "scale": 100.0}},
-            },
+            **lights,
         }
     )
     return np.array(mi.render(scene, spp=spp))
@@ -189,6 +193,23 @@ def test_orders_in_cycles_are_those_of_the_path_tracer(
         assert delta_E(*scaled) < 5
         checked += 1
     assert checked >= (1 if shape == "sphere" else 2)  # whose orders touch each other
+
+
+@pytest.mark.slow
+@needs_blender
+@pytest.mark.parametrize(("shape", "material"), [("plane", "Al"), ("sphere", "Au"), ("disc", "Cu")])
+def test_a_metal_under_a_sky_is_as_bright_as_by_the_path_tracer(shape, material, command, tmp_path, llvm):
+    shader = tmp_path / "grating.osl"
+    code, _, error = command("export", f"sinusoidal,period=1.6,depth=0.15,material={material}", "-o", str(shader))
+    assert code == 0, error
+    bsdf = {"type": "diffraction_grating", "profile": "sinusoidal", "period": 1.6, "depth": 0.15, "material": material}
+    if shape == "disc":
+        bsdf["orientation"] = "radial"
+    middle = np.s_[SIZE // 2 - 12 : SIZE // 2 + 12, SIZE // 2 - 12 : SIZE // 2 + 12]
+    ours = path_traced(bsdf, shape, "sky", 256)[middle].mean(axis=(0, 1))
+    cycles = in_cycles(shader, shape, "sky", 400, tmp_path)[middle].mean(axis=(0, 1))
+    assert cycles @ SRGB_TO_XYZ[1] == pytest.approx(ours @ SRGB_TO_XYZ[1], rel=0.1)
+    assert delta_E(linear_sRGB_to_XYZ(ours), linear_sRGB_to_XYZ(cycles)) < 5
 
 
 @pytest.mark.slow
