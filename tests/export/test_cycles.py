@@ -155,7 +155,7 @@ def path_traced(bsdf, shape, light, spp):
     [
         ("plane", "sinusoidal,period=1.6,depth=0.15", 30, 0.15, 1200),
         ("disc", "blazed,period=1.9,depth=0.2", 30, 0.15, 1200),
-        ("sphere", "foil", 12, 0.35, 2500),
+        ("sphere", "foil", 12, 0.15, 9000),
     ],
 )
 def test_orders_in_cycles_are_those_of_the_path_tracer(
@@ -175,7 +175,7 @@ def test_orders_in_cycles_are_those_of_the_path_tracer(
     }
     if shape == "disc":
         bsdf["orientation"] = "radial"
-    ours = path_traced(bsdf, shape, radius, 1024)
+    ours = path_traced(bsdf, shape, radius, 4096)
     cycles = in_cycles(shader, shape, radius, samples, tmp_path)
     luminance, found = (picture @ SRGB_TO_XYZ[1] for picture in (ours, cycles))
     labels, count = ndimage.label(ndimage.maximum_filter(luminance > 0.02 * luminance.max(), 3))
