@@ -42,7 +42,8 @@ LEVELS = (
     ("viewer",),
     ("registration",),
     ("cli", "__main__"),
-    ("shader_2014", "evaluation"),
+    ("evaluation",),
+    ("shader_2014",),
 )
 LEVEL_OF = {name: level for level, names in enumerate(LEVELS) for name in names}
 

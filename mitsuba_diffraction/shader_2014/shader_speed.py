@@ -2,19 +2,23 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import drjit as dr
 import mitsuba as mi
 import numpy as np
+from rich.table import Table
 
 from ..bsdf.testing import vectors
 from ..evaluation.benchmark.accuracy import Exact, patch_difference, patch_directions
 from ..evaluation.benchmark.cases import Case
 from ..evaluation.benchmark.speed import Rays, seconds
+from ..evaluation.report import cells
 from ..optics.color import SRGB_TO_XYZ
 from ..optics.geometry import k_g
+from ..progress import table
+from ..settings import VISIBLE
 from .evaluate import shader_for
 from .quirks import Quirks
 from .shader import Shader
@@ -22,7 +26,7 @@ from .tristimulus import PUBLISHED_R0
 
 _SHADERS = (("flss", "as published"), ("flss", "corrected"), ("nmm", "as published"), ("pq", "as published"))
 
-SHADER_COLUMNS = {
+_COLUMNS = {
     "surface": "{.surface}",
     "shader": "{.shader}",
     "texel reads": "{.texel_reads}",
@@ -51,16 +55,15 @@ class ShaderSpeed:
     delta_e: tuple[float, float]
 
 
-def shader_speeds(case: Case, exact: Exact, *, count: int = 1 << 14, repetitions: int = 3) -> list[ShaderSpeed]:
+def shader_speeds(case: Case, *, count: int = 1 << 14, repetitions: int = 3) -> list[ShaderSpeed]:
     """Measure the shaders on a tile under the current variant.
 
     Args:
         case: the tile.
-        exact: of the same case.
         count: shading points at once.
         repetitions: of each timing, interleaved.
     """
-    rays = Rays(count)
+    exact, rays = Exact(case, VISIBLE), Rays(count)
     rough = mi.load_dict({"type": "roughconductor", "material": "Al"})
     shaders = shaders_of(case)
     work = {"rough": lambda: rays.evaluate(rough)}
@@ -76,6 +79,11 @@ def shader_speeds(case: Case, exact: Exact, *, count: int = 1 << 14, repetitions
         )
         for name, shader in shaders.items()
     ]
+
+
+def speed_table(shaders: Sequence[ShaderSpeed]) -> Table:
+    """Return a table of the shaders, for a terminal."""
+    return table(_COLUMNS, (cells(_COLUMNS, row) for row in shaders), texts=2)
 
 
 def shaders_of(case: Case) -> dict[str, Shader]:

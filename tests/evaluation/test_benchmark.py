@@ -61,11 +61,10 @@ def test_the_material_of_measured_reflects_and_is_sampled(llvm):
 def test_a_run_reports_every_combination(llvm, tmp_path):
     deep = Case("deep", gratings.sinusoidal(2.5, 2.0), "tile", 65.0)
     steps = []
-    results, shaders = study.run_benchmark(
+    results = study.run_benchmark(
         [BLAZE, deep],
         tolerances=(1e-2,),
         count=1 << 12,
-        shading_points=1 << 8,
         repetitions=1,
         progress=lambda done, total: steps.append((done, total)),
     )
@@ -77,16 +76,8 @@ def test_a_run_reports_every_combination(llvm, tmp_path):
         assert min(result.beside_measured) > 0
         assert result.accuracy.l1 <= 1e-2
     console = Console(width=200, record=True)
-    console.print(*study.benchmark_tables(results, shaders, []))
-    text = console.export_text()
-    assert "flss, as published" in text
-
-    published, corrected = shaders[0], shaders[1]
-    assert (published.surface, published.shader) == ("blaze", "flss, as published")
-    assert published.texel_reads > 20_000
-    # Without its quirks the shader shows this model's colours, but for its 5 nm steps and the patches' 10 nm.
-    assert corrected.delta_e[0] < published.delta_e[0]
-    assert corrected.delta_e[0] < 1
+    console.print(*study.benchmark_tables(results, []))
+    assert "blaze" in console.export_text()
     study.save_speed_plot(results, tmp_path / "plot.png")
     with Image.open(tmp_path / "plot.png") as picture:
         assert picture.width > 600
@@ -102,7 +93,7 @@ def test_sampling_is_measured(llvm):
     assert found.variance_ratio > 1
     assert found.picture_ratio > 0
     console = Console(width=200, record=True)
-    console.print(*study.benchmark_tables([], [], [found]))
+    console.print(*study.benchmark_tables([], [found]))
     assert "blaze" in console.export_text()
 
 

@@ -17,8 +17,6 @@ from ...files.writing import whole_file
 from ...precomputation.grating_spectrum import GratingSpectrum
 from ...progress import Progress, silent, table
 from ...settings import VISIBLE, ScalarSettings
-from ...shader_2014 import shader_speed
-from ...shader_2014.shader_speed import ShaderSpeed, shader_speeds
 from ...spectrum.tables import SliceTable
 from .. import report
 from . import sampling
@@ -91,22 +89,20 @@ def run_benchmark(
     *,
     tolerances: Sequence[float] = TOLERANCES,
     count: int = 1 << 19,
-    shading_points: int = 1 << 14,
     repetitions: int = 5,
     progress: Progress = silent,
-) -> tuple[list[Result], list[ShaderSpeed]]:
+) -> list[Result]:
     """Measure under the current variant.
 
     Args:
         cases: surfaces.
         tolerances: of their spectra.
         count: rays at once.
-        shading_points: of the real-time shaders at once.
         repetitions: of each timing, interleaved.
         progress: called with (steps done, steps in total).
 
     Returns:
-        A result for every combination, in order; and the real-time shaders on the tiles.
+        A result for every combination, in order.
 
     Raises:
         ValueError: if a tolerance is out of range, or a surface too large for it.
@@ -114,20 +110,19 @@ def run_benchmark(
     for tolerance in tolerances:
         ScalarSettings(tolerance=tolerance)
     cases = list(cases)
-    results, shaders, total = [], [], len(cases) * len(tolerances)
+    results: list[Result] = []
+    total = len(cases) * len(tolerances)
     progress(0, total)
     rays = Rays(count)
     for case in cases:
         exact = Exact(case, VISIBLE)
-        if case.extent == "tile":
-            shaders += shader_speeds(case, exact, count=shading_points, repetitions=min(repetitions, 3))
         for tolerance in tolerances:
             start = time.perf_counter()
             spectrum = case.spectrum(tolerance)
             build_seconds = time.perf_counter() - start
             results.append(_measured(case, spectrum, build_seconds, exact, rays, repetitions))
             progress(len(results), total)
-    return results, shaders
+    return results
 
 
 def _measured(
@@ -161,15 +156,10 @@ def _measured(
     )
 
 
-def benchmark_tables(
-    results: Sequence[Result], shaders: Sequence[ShaderSpeed], sampled: Sequence[Sampling]
-) -> list[Table]:
-    """Return tables of speed and error, of the real-time shaders and of sampling, for a terminal."""
+def benchmark_tables(results: Sequence[Result], sampled: Sequence[Sampling]) -> list[Table]:
+    """Return tables of speed and error, and of sampling, for a terminal."""
     return [
         table(RESULT_COLUMNS, (report.cells(RESULT_COLUMNS, result) for result in results)),
-        table(
-            shader_speed.SHADER_COLUMNS, (report.cells(shader_speed.SHADER_COLUMNS, row) for row in shaders), texts=2
-        ),
         table(sampling.SAMPLING_COLUMNS, (report.cells(sampling.SAMPLING_COLUMNS, row) for row in sampled)),
     ]
 

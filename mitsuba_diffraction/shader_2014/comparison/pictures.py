@@ -16,6 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ...errors import RequestError
+from ...evaluation.benchmark.noise import shows_gratings
 from ...optics.color import spectrum_to_XYZ
 from ...progress import Progress, part, silent
 from ...render import SpectralImage
@@ -196,7 +197,7 @@ class Pictures:
             raise RequestError(f"{scene_path}: its integrator is the shader itself, wanted a path tracer (type='path')")
         if (found := recorded_range(self.scene)) != VISIBLE:
             raise RequestError(f"{scene_path}: got a film of {found[0]:g} to {found[1]:g} nm, wanted visible light")
-        gratings, outer = gratings_of(self.scene)
+        gratings, _ = gratings_of(self.scene)
         if not gratings:
             raise RequestError("no shape has a diffraction_grating, there is nothing to compare")
         if not pigment:
@@ -206,9 +207,7 @@ class Pictures:
         self._others: dict[tuple[bool, bool, int], Picture] = {}
         self.use(shader)
         self.film_size = tuple(int(size) for size in self.scene.sensors()[0].film().size())
-        self.surface = _shows_gratings(self.scene, outer)
-        if not self.surface.any():
-            raise RequestError(f"{scene_path}: no pixel shows only a grating, there is nothing to compare")
+        self.surface = shows_gratings(self.scene, across=4)
 
     def use(self, shader: str) -> None:
         """Choose the shader, one of `VARIANTS`, of the next pictures."""
@@ -484,18 +483,3 @@ def _wavelengths_of_the_shader() -> Iterator[tuple[mi.UnpolarizedSpectrum, list[
         spectra = [mi.UnpolarizedSpectrum(*column) for column in some.T.tolist()]
         dr.make_opaque(spectra)  # so that all share a kernel
         yield spectra[0], spectra[1:]
-
-
-def _shows_gratings(scene: mi.Scene, outer: list[mi.BSDF]) -> NDArray[np.bool_]:
-    """Return a mask of the pixels in which all of 4 × 4 rays hit one of some BSDFs, (height, width)."""
-    sensor = scene.sensors()[0]
-    columns, rows = sensor.film().crop_size()
-    y, x = (np.mgrid[: 4 * rows, : 4 * columns].reshape(2, -1) + 0.5) / np.array([[4 * rows], [4 * columns]])
-    position = mi.Point2f(x.astype(np.float32), y.astype(np.float32))
-    ray, _ = sensor.sample_ray(0.0, 0.5, position, mi.Point2f(0.5))
-    si = scene.ray_intersect(ray)
-    of_grating = mi.Bool(False)
-    for bsdf in outer:
-        of_grating |= si.bsdf() == mi.BSDFPtr(bsdf)
-    hit = np.array(si.is_valid() & of_grating).reshape(rows, 4, columns, 4)
-    return np.asarray(hit.all(axis=(1, 3)))

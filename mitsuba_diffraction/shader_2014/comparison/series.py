@@ -5,9 +5,7 @@ All pictures have the same random numbers.
 
 from __future__ import annotations
 
-import functools
 import itertools
-import operator
 import os
 import time
 from collections.abc import Callable, Mapping, Sequence
@@ -19,9 +17,9 @@ import mitsuba as mi
 import numpy as np
 from numpy.typing import NDArray
 
-from ...bsdf.base import gratings_in
 from ...bsdf.theory import errors_shown
 from ...errors import RequestError
+from ...evaluation.benchmark.noise import shows_gratings
 from ...optics.color import XYZ_to_linear_sRGB, delta_E, into_gamut, on_screen, spectrum_to_XYZ
 from ...precomputation.grating_spectrum import GratingSpectrum
 from ...progress import Progress, no_progress
@@ -200,20 +198,6 @@ def _traced(scene: mi.Scene, samples: int) -> tuple[Picture, float]:
     seconds = clock() - compiled
     image = SpectralImage(channel_wavelengths(), sums.radiance())
     return Picture(image, sums.samples, seconds), max(0.0, compiled - begin - seconds / len(passes))
-
-
-def shows_gratings(scene: mi.Scene) -> NDArray[np.bool_]:
-    """Return a mask of the pixels whose centres show a grating, (height, width)."""
-    sensor = scene.sensors()[0]
-    columns, rows = sensor.film().crop_size()
-    y, x = (np.mgrid[:rows, :columns].reshape(2, -1) + 0.5) / np.array([[rows], [columns]])
-    position = mi.Point2f(x.astype(np.float32), y.astype(np.float32))
-    si = scene.ray_intersect(mi.Ray3f(sensor.sample_ray(0.0, 0.5, position, mi.Point2f(0.5))[0]))
-    shapes = [shape for shape in scene.shapes() if gratings_in(shape.bsdf())]
-    shown = functools.reduce(operator.or_, (si.shape == mi.ShapePtr(shape) for shape in shapes))
-    if not np.any(shown):
-        raise RequestError("scene: no pixel shows a grating, there is nothing to compare")
-    return np.array(shown).reshape(rows, columns)
 
 
 def _delta_e(

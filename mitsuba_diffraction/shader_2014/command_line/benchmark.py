@@ -1,4 +1,4 @@
-"""`mitsuba-diffraction benchmark`: speed against error."""
+"""`mitsuba-diffraction benchmark`: speed against error, of this model and of the shader of 2014."""
 
 from __future__ import annotations
 
@@ -35,11 +35,12 @@ def benchmark(
     """Measure error and speed of the tables, relative to Mitsuba's roughconductor."""
     import mitsuba as mi
 
+    from ...evaluation.benchmark.cases import bundled_cases, scan_case
+    from ...evaluation.benchmark.sampling import measure
+    from ...evaluation.benchmark.speed import machine
+    from ...evaluation.benchmark.study import TOLERANCES, benchmark_tables, run_benchmark, save_speed_plot
     from ...variants import choose_variant
-    from ..benchmark.cases import bundled_cases, scan_case
-    from ..benchmark.sampling import measure
-    from ..benchmark.speed import machine
-    from ..benchmark.study import TOLERANCES, benchmark_tables, run_benchmark, save_speed_plot
+    from ..shader_speed import shader_speeds, speed_table
 
     if plot is not None:
         check_suffix("--plot", plot, ".png")
@@ -64,11 +65,16 @@ def benchmark(
         _measure_noise(json)
         return
     with progress_bar("speed and error") as progress:
-        results, shaders = run_benchmark(cases, tolerances=tolerance or TOLERANCES, progress=progress)
+        results = run_benchmark(cases, tolerances=tolerance or TOLERANCES, progress=progress)
+    with progress_bar("shader of 2014") as progress:
+        shaders = []
+        for number, case in enumerate(tiles := [case for case in cases if case.extent == "tile"], 1):
+            shaders += shader_speeds(case)
+            progress(number, len(tiles))
     with progress_bar("sampling") as progress:
         # Pictures need no more.
         sampling = measure(cases, max(tolerance or TOLERANCES), progress=progress)
-    show(*benchmark_tables(results, shaders, sampling), width=140)
+    show(*benchmark_tables(results, sampling), speed_table(shaders), width=140)
     if json is not None:
         found = {"speed and error": results, "real-time shader": shaders, "sampling": sampling}
         outputs.save_json({"machine": machine(), **found}, json)
@@ -77,10 +83,10 @@ def benchmark(
 
 
 def _measure_terms(json: Path | None, plot: Path | None) -> None:
-    from ...shader_2014 import terms
-    from ..benchmark.cases import TIMED_TILES, tiles
-    from ..benchmark.speed import machine
-    from ..plots import save_png
+    from ...evaluation.benchmark.cases import TIMED_TILES, tiles
+    from ...evaluation.benchmark.speed import machine
+    from ...evaluation.plots import save_png
+    from .. import terms
 
     with progress_bar("number of terms") as progress:
         found = terms.measure_terms(tiles(), TIMED_TILES, progress=progress)
@@ -92,9 +98,9 @@ def _measure_terms(json: Path | None, plot: Path | None) -> None:
 
 
 def _measure_noise(json: Path | None) -> None:
-    from .. import report
-    from ..benchmark.noise import NOISE_COLUMNS, measure_noise
-    from ..benchmark.speed import machine
+    from ...evaluation import report
+    from ...evaluation.benchmark.noise import NOISE_COLUMNS, measure_noise
+    from ...evaluation.benchmark.speed import machine
 
     with progress_bar("noise of pictures") as progress:
         noise = measure_noise(progress=progress)
