@@ -790,7 +790,13 @@ def derivatives_are_differences(case: Case):
     fixed = ["to_uv", "to_world", "weight", "opacity", "a.reflectance"]
     if c.lateral_scale == 1 and not (c.is_resolved and c.coherence_length >= 16):
         fixed.append("lateral_scale")  # refused with a derivative where orders overlap
-    keys = [key for key in parameters.keys() if ".bsdf." in key and not any(part in key for part in fixed)]  # noqa: SIM118
+    keys = [
+        key
+        for key in parameters.keys()  # noqa: SIM118
+        if ".bsdf." in key
+        and not any(part in key for part in fixed)
+        and not parameters.flags(key) & mi.ParamFlags.NonDifferentiable.value  # such as the range of a spectrum
+    ]
     key = keys[c.derived % len(keys)]
     name = next((part for part in key.split(".") if part in STEPS), "")
     step, start, like = STEPS.get(name, 5e-3), np.array(parameters[key], np.float32), type(parameters[key])
