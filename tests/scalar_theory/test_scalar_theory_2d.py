@@ -22,10 +22,11 @@ def test_the_estimate_is_within_its_factor(part):
         assert scalar_theory_2d.rms_factor(chosen, part) < 1.5
 
 
-def test_the_page_has_the_table():
+def test_the_page_has_rows_of_the_table():
     page = (Path(__file__).parents[2] / "docs" / "validation.md").read_text(encoding="utf-8")
-    for row in scalar_theory_2d.rows():
-        assert row in page
+    table = page.partition("| surface, period × depth |")[2].partition("\n\n")[0].splitlines()[2:]
+    assert len(table) == 5
+    assert set(table) <= set(scalar_theory_2d.rows())
 
 
 @pytest.mark.parametrize("count", [5, pytest.param(None, marks=pytest.mark.slow)])

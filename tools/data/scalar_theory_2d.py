@@ -135,7 +135,7 @@ def rms_factor(cases: Sequence[dict[str, Any]], part: int) -> float:
 
 
 def rows() -> list[str]:
-    """Return the rows of the table of docs/validation.md."""
+    """Return the rows of a table, of which docs/validation.md has some."""
 
     def pair(case: dict[str, Any], part: int) -> str:
         return ", ".join(f"{100 * float(f'{case[name][part]:.2g}'):.3g} %" for name in ("error", "estimated"))
