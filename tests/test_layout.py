@@ -24,7 +24,7 @@ MODULES = {
 
 LEVELS = (
     # The lowest first: modules import from the levels above their own in this list, and from their own.
-    ("array_types", "errors", "plugin_parameters", "progress", "settings", "variants"),
+    ("array_types", "errors", "handed_over_spectra", "parameter_documentation", "progress", "settings", "variants"),
     ("files",),
     ("optics",),
     ("surface",),

@@ -10,7 +10,7 @@ import mitsuba as mi
 
 from ..errors import RequestError, did_you_mean
 from ..optics.materials import DISPERSION
-from ..plugin_parameters import Parameter, listed
+from ..parameter_documentation import Parameter, listed
 from ..precomputation.recipe import MAX_PATCHES, Recipe, parameters_of_profile
 from ..surface.gratings import PROFILES, RENAMED
 from .base import living

@@ -13,9 +13,9 @@ import mitsuba as mi
 import numpy as np
 
 from ..errors import RequestError, is_number
+from ..handed_over_spectra import handed_over
 from ..optics.geometry import SHADOWING
 from ..optics.materials import KnownRange, RefractiveIndex, index_of, is_file
-from ..plugin_parameters import handed_over
 from ..precomputation.recipe import REQUESTED, Recipe, source_named
 from ..precomputation.spectra import Spectrum, load_spectrum
 from ..rigorous.rigorous_spectrum import RigorousSpectrum

@@ -8,7 +8,7 @@ import numpy as np
 
 from ..bsdf.base import nested_plugin
 from ..errors import RequestError
-from ..plugin_parameters import Parameter, listed
+from ..parameter_documentation import Parameter, listed
 from .paths import Gratings, LightPaths, define_eye_paths, implements, unpacked
 
 PARAMETERS = (

@@ -17,7 +17,7 @@ from pathlib import Path
 import mitsuba as mi
 
 from ..errors import Bug, RequestError, root_cause
-from ..plugin_parameters import hand_over
+from ..handed_over_spectra import hand_over
 
 classes: dict[tuple[str, str], type] = {}
 """Module and variant → class of a plugin. Not in `plugins`, which Mitsuba 3.10 reloads."""

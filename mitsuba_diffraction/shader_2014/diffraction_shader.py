@@ -14,7 +14,7 @@ from ..bsdf.device_tables import opaque
 from ..bsdf.fresnel import Dielectric
 from ..bsdf.layers import Layers
 from ..errors import RequestError
-from ..plugin_parameters import Parameter, listed
+from ..parameter_documentation import Parameter, listed
 from .evaluate import VARIANTS
 from .lights import Light, lights_of, sampled_spectrum
 from .pq import PQ

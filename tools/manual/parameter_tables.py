@@ -12,7 +12,7 @@ from pathlib import Path
 
 from mitsuba_diffraction.bsdf import diffraction_grating
 from mitsuba_diffraction.integrator import diffraction_path
-from mitsuba_diffraction.plugin_parameters import Parameter
+from mitsuba_diffraction.parameter_documentation import Parameter
 from mitsuba_diffraction.shader_2014 import diffraction_shader
 
 PAGE = Path(__file__).parents[2] / "docs" / "plugin.md"
