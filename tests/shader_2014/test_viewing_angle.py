@@ -376,7 +376,7 @@ def test_the_stored_periods_are_those_of_the_code_as_it_is(name, llvm):
     found = [reflectance_map(surface, method, wavelengths=wavelengths()) for method in methods]
     measured = period_rows(surface, found, 5.0)
     assert len(measured) > len(methods)
-    page = (ROOT / "docs" / "evaluation.md").read_text(encoding="utf-8").splitlines()
+    page = (ROOT / "docs" / "published.md").read_text(encoding="utf-8").splitlines()
     assert {line for line in page if line.startswith(f"| {surface.name} |")} <= set(lines)
     for row in measured:
         page = listed[row[1]]

@@ -2,7 +2,7 @@
 
     python tools/thesis/evaluation.py FOLDER [SURFACE …]
 
-`docs/evaluation.md` discusses them.
+`docs/published.md` discusses them.
 """
 
 from __future__ import annotations
