@@ -212,10 +212,13 @@ class SpectralConductor(Material):
         self.update()
 
     def update(self) -> None:
-        check_spectra(*self.textures)
+        # Here, and not in `known`, which Dr.Jit calls while it records `eval`.
+        eta, k = self.textures
+        self._known = known_spectrum("eta", eta), known_spectrum("k", k)
+        check_spectra(eta, k, *self._known)
 
     def known(self) -> tuple[KnownRange, ...]:
-        return tuple(known_spectrum(name, spectrum) for name, spectrum in zip(("eta", "k"), self.textures, strict=True))
+        return self._known
 
     def __call__(self, si: mi.SurfaceInteraction3f, cos_half: Cosines, active: mi.Bool) -> mi.UnpolarizedSpectrum:
         pairs = zip(mi.UnpolarizedSpectrum(cos_half), self.index(si, active), strict=True)

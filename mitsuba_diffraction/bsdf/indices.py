@@ -129,16 +129,16 @@ def known_spectrum(name: str, texture: mi.Texture) -> KnownRange:
     return KnownRange(name, "its spectrum", (float(shortest), float(longest)))
 
 
-def check_spectra(eta: mi.Texture, k: mi.Texture) -> None:
-    """Check η + ik at the pixels of pictures, and at wavelengths 1 nm apart where both are known.
+def check_spectra(eta: mi.Texture, k: mi.Texture, *known: KnownRange) -> None:
+    """Check η + ik at the pixels of pictures, and at wavelengths 1 nm apart where both are `known`.
 
     Mitsuba's textures take any number when parameters change.
 
     Raises:
         RequestError: if it is no index: negative, not a number, or out of range.
     """
-    ranges = [known_spectrum(name, texture).wavelengths for name, texture in (("eta", eta), ("k", k))]
-    first, last = max(low for low, _ in ranges), min(high for _, high in ranges)
+    lows, highs = zip(*(of_one.wavelengths for of_one in known), strict=True)
+    first, last = max(lows), min(highs)
     first, last = first or VISIBLE[0], last if np.isfinite(last) else VISIBLE[1]
     shape, count = (1, 1), int(np.clip(last - first, 1, MAX_INDEX_NODES))
     if eta.is_spatially_varying() or k.is_spatially_varying():

@@ -44,6 +44,8 @@ _SCALAR_ONLY = {
     "height_scale": "build the spectrum of the other depth",
     "lateral_scale": "build the spectrum of the other period",
     "base": "transmitted light is not computed; leave it out",
+    "eta": "the spectrum has the index of its material; leave it out",
+    "k": "the spectrum has the index of its material; leave it out",
     "conserve_energy": "they conserve energy by themselves; leave it out",
     "shadowing": "it is part of the efficiencies; leave it out",
     "thin_film_thickness": "its tables are of bare surfaces; leave it out",

@@ -230,7 +230,7 @@ class FilmedMaterial(Material):
         self.below, self.films, self.thickness, self.scale = below, films, thickness, scale
         self.outside, self.coat = below.outside, below.coat
         self.transparent, self.dispersion = below.transparent, below.dispersion
-        self.varies, self.count = thickness.varies or scale.varies, opaque(len(films))
+        self.varies, self.count = below.varies or thickness.varies or scale.varies, opaque(len(films))
         has_number = len(films) == 1 and films[0].is_constant and not films[0].absorbs
         self.indices: mi.Float | Dispersion = (
             opaque(films[0].nominal.real / self.outside) if has_number else Dispersion(films, self.outside)

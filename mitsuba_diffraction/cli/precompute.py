@@ -10,6 +10,7 @@ import typer
 from ..errors import RequestError
 from ..files.outputs import check_outputs
 from ..precomputation.recipe import Recipe, source_named
+from ..precomputation.spectra import check_material
 from ..progress import bytes_text, durations, progress_bar, stage, tell
 from ..settings import ORIGINS, REPRESENTATIONS, SUN_COHERENCE_LENGTH, THEORIES
 from ..surface.prepare import is_seam_visible, seam_steps
@@ -85,6 +86,7 @@ def precompute(
 
 def _precompute(source: Path, recipe: Recipe, target: Path, seam: str, verbose: bool) -> None:
     """Compute, save and report one spectrum."""
+    check_material(recipe.settings)
     with progress_bar(f"spectrum of {source.name}", "%") as progress:
         spectrum = recipe.build(progress)
         with stage("writing"):

@@ -183,13 +183,13 @@ class Recipe:
             surface, spectrum = content.get("surface", {}), content.get("spectrum", {})
             if not (isinstance(surface, dict) and isinstance(spectrum, dict)):
                 raise RequestError("wanted the tables [surface] and [spectrum]")
-            # Files of indices are named relative to the recipe.
+            # Files are named relative to the recipe, wherever the process goes.
             of_files = {name for name in ("material", "int_ior") if is_file(spectrum.get(name))}
             folder = path.parent.absolute()
             spectrum = {**spectrum, **{name: str(folder / spectrum[name]) for name in of_files}, **settings}
             _refuse_unknown("[spectrum]", spectrum, _SPECTRUM_KEYS)
             _refuse_other_values(spectrum)
-            return cls(surface, Settings.of(**spectrum), path.parent)
+            return cls(surface, Settings.of(**spectrum), folder)
         except RequestError as error:
             in_file = str(error).partition(":")[0] not in settings
             raise RequestError(f"{path}: {error}" if in_file else str(error)) from None

@@ -13,6 +13,7 @@ import numpy as np
 
 from ..errors import RequestError
 from ..files.writing import cache_folder
+from ..optics.materials import index_of
 from ..progress import Progress, silent
 from ..rigorous import build_table as rigorous
 from ..rigorous.rigorous_spectrum import RIGOROUS_FORMAT as RIGOROUS_FORMAT
@@ -59,6 +60,7 @@ def precompute(
     patches = (height_field,) if isinstance(height_field, HeightField) else tuple(height_field)
     if not all(isinstance(patch, HeightField) for patch in patches):
         raise RequestError(f"height_field: got {type(height_field).__name__}, wanted a HeightField or several")
+    check_material(request)
     spectrum = build_spectrum(patches, request, progress)
     for concern in spectrum.concerns:
         warnings.warn(concern, stacklevel=2)
@@ -109,6 +111,22 @@ def build_spectrum(
             f"theory: got rigorous and {len(patches)} patches ({first.source}, …), wanted one, of one row"
         )
     return rigorous.build_rigorous(first, settings, progress, cache_folder())
+
+
+def check_material(settings: Settings) -> None:
+    """Check that the index of a rigorous table is known at all its wavelengths: a scene does not know its material.
+
+    Raises:
+        RequestError: if it is not.
+    """
+    if not isinstance(settings, RigorousSettings) or not settings.material:
+        return
+    shortest, longest = (wavelength * settings.ext_ior for wavelength in settings.wavelengths)
+    try:
+        index_of("material", settings.material).known("material").check((shortest, longest))
+    except RequestError as error:
+        inside = f"; inside ext_ior={settings.ext_ior:g} wavelengths are shorter" if settings.ext_ior != 1 else ""
+        raise RequestError(f"{error}{inside}") from None
 
 
 def build_versions(settings: Settings) -> list[int]:

@@ -109,7 +109,7 @@ def test_below_a_coat_a_rigorous_spectrum_is_refused_with_the_wavelengths_that_i
         return {"type": "diffraction_grating", "spectrum": of, "material": "Al", "coat_ior": 1.5}
 
     with pytest.raises(RuntimeError, match=r"those inside of the index 1\.4") as refused:
-        mi.load_dict(scene(bsdf((360, 830))))
+        mi.load_dict(scene(bsdf((300, 590))))
     first, last = map(float, re.search(r"=\((.*), (.*)\)", str(refused.value)).groups())
     assert (first, last) == pytest.approx((360 / 1.5, 830 / 1.5), rel=1e-3)
     mi.load_dict(scene(bsdf((first, last))))
@@ -340,6 +340,20 @@ def test_light_that_the_material_of_a_rigorous_recipe_lacks_is_refused(llvm, tmp
     mi.render(loaded, spp=1)
 
 
+def test_a_rigorous_table_to_be_saved_is_of_wavelengths_at_which_its_index_is_known(tmp_path, command):
+    # A scene knows the wavelengths of a saved table, but not the range of its material.
+    settings = {"theory": "rigorous", "material": table(tmp_path, "glass.csv", ["0.42,1.7,0", "0.68,1.6,0"])}
+    refusal = r"material: got light of 360 to 830 nm, and a table of 420 to 680 nm \(glass\.csv\)"
+    with pytest.raises(ValueError, match=refusal):
+        md.precompute(md.gratings.sinusoidal(0.7, 0.1), **settings)
+    with pytest.raises(ValueError, match=r"light of 420 to 840 nm, .* inside ext_ior=1\.2 wavelengths are shorter"):
+        md.precompute(md.gratings.sinusoidal(0.7, 0.1), **settings, ext_ior=1.2, wavelengths=(350, 700))
+    options = (f"--{name}={value}" for name, value in settings.items())
+    code, _, error = command("precompute", "sinusoidal", *options, "-o", str(tmp_path / "table.exr"))
+    assert code == 2
+    assert re.search(refusal, error)
+
+
 @pytest.mark.few(2)
 @pytest.mark.parametrize("named", NAMED)
 def test_an_infrared_table_is_the_index_in_infrared_light(llvm, tmp_path, named):
@@ -406,6 +420,12 @@ def test_an_index_that_becomes_none_is_refused(llvm, name, bad):
     parameters[f"{name}.value"] = bad
     with pytest.raises(ValueError, match=f"{name}: got {bad:g}".replace("+", r"\+") + ", wanted 0 to 100"):
         parameters.update()
+
+
+def test_spectra_of_an_index_are_not_traversed_while_eval_is_recorded(llvm, monkeypatch):
+    bsdf = mi.load_dict({**FLAT, "eta": spectrum_of(1, 1, 1), "k": 3.0})
+    monkeypatch.setattr("mitsuba.traverse", lambda _: pytest.fail("traversed"))
+    assert albedo(bsdf, direction(20, 40), wavelengths=WAVELENGTHS).max() > 0
 
 
 def test_a_spectrum_that_comes_to_end_inside_the_light_is_refused(llvm):

@@ -244,6 +244,12 @@ def test_a_thickness_may_vary_over_the_surface(llvm):
         np.testing.assert_allclose(evaluate(varying, wi, wo, uv=(u, 0.5))[0], expected, rtol=1e-5)
 
 
+def test_a_metal_may_vary_under_a_film(llvm):
+    metal = bitmap([[0.5, 2.0]], filter_type="nearest")
+    filmed = load(eta=metal, k=3.0, thin_film_ior=2.0, thin_film_thickness=0.1)
+    assert mi.has_flag(filmed.flags(), mi.BSDFFlags.SpatiallyVarying)
+
+
 @pytest.mark.slow
 @pytest.mark.parametrize(("mode", "side"), [("reflection", 1), ("interface", 1), ("interface", -1), ("sheet", -1)])
 def test_samples_pass_the_chi_square_test(llvm, mode, side):

@@ -287,8 +287,10 @@ def test_a_scan_is_relative_to_its_recipe(tmp_path, monkeypatch):
     (tmp_path / "scans").mkdir()
     heights = write_scan(tmp_path / "scans")
     path = write(tmp_path, '[surface]\nscan = "scans/scan.npy"\npixel_size = [0.05, 0.08]\n')
+    monkeypatch.chdir(path.parent)
+    recipe = Recipe.load(path.name)
     monkeypatch.chdir("/")
-    field = Recipe.load(path).height_field()
+    field = recipe.height_field()
     np.testing.assert_array_equal(field.heights, heights)
     assert field.pixel_size == (0.05, 0.08)
 
