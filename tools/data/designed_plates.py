@@ -148,7 +148,7 @@ def of_case(case: dict[str, Any]) -> Design:
 
 
 def rows() -> list[str]:
-    """Return the rows of the table of docs/design.md, with the ranges over the wavelengths."""
+    """Return the rows of a table, of which docs/design.md has some, with the ranges over the wavelengths."""
 
     def between(values: list[float], digits: int, unit: float = 1.0) -> str:
         first, last = (f"{value / unit:.{digits}f}" for value in (min(values), max(values)))
