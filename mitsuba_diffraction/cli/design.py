@@ -5,6 +5,9 @@ from __future__ import annotations
 import functools
 import inspect
 import math
+import signal
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Annotated
 
@@ -107,7 +110,8 @@ def design(
         fitting = math.ceil(_LEGIBLE * strokes / resolved_strokes(1, texel, angle, longest))
         texels = min(max(fitting, _MIN_TEXELS), _MAX_TEXELS)
         note = f"{texels} texels along the period; the finest strokes are 1/{strokes:.0f} of the picture"
-    with named_as_options(options), progress_bar(f"design of {target.name}", "iterations") as progress:
+    bar = progress_bar(f"design of {target.name}", "iterations")
+    with named_as_options(options), bar as progress, _sigterm_interrupts():
         found = search(
             picture,
             texel,
@@ -144,6 +148,20 @@ def design(
         tell(str(verdict))
     if found.interrupted:
         raise Stopped(f"{relief} holds the best relief so far")
+
+
+@contextmanager
+def _sigterm_interrupts() -> Iterator[None]:
+    """Let SIGTERM, with which schedulers end a job, interrupt as Ctrl-C does."""
+
+    def interrupt(number: int, frame: object) -> None:
+        raise KeyboardInterrupt
+
+    before = signal.signal(signal.SIGTERM, interrupt)
+    try:
+        yield
+    finally:
+        signal.signal(signal.SIGTERM, before)
 
 
 def _say_effort(chosen: str, seconds: float, memory: float) -> None:

@@ -237,6 +237,9 @@ class _Periodogram:
             waves = next(
                 (other for other in self._maxima if _same_wave(waves / self.size, other / self.size, 1)), waves
             )
+            # The summit is at most one bin away along each axis. It takes long to find in a large scan.
+            if self._strength(waves / self.size, _LOBE_RADIUS + 2**0.5) < _MIN_STRENGTH:
+                continue
             q = self.summit(waves / self.size)[0]
             if (strength := self._strength(q)) >= _MIN_STRENGTH:
                 yield q, strength
@@ -254,10 +257,10 @@ class _Periodogram:
                 return np.asarray(others[np.argmin(miss)])
         return np.asarray(waves)
 
-    def _strength(self, q: Real) -> float:
-        """Return the fraction of the power in the lobes about q and −q."""
+    def _strength(self, q: Real, radius: float = _LOBE_RADIUS) -> float:
+        """Return the fraction of the power in the lobes about q and −q, of a radius in bins."""
         away = np.hypot(*(self._waves - (q * self.size)[:, None, None]))
-        return float(min(2 * self._power[away <= _LOBE_RADIUS].sum() / self._power.sum(), 1.0))
+        return float(min(2 * self._power[away <= radius].sum() / self._power.sum(), 1.0))
 
     def summit(self, q: Real) -> tuple[Real, float]:
         """Return the maximum of the power near a frequency, at most one bin away, and the power there."""

@@ -1,5 +1,6 @@
 """The command `design`: its files, what it says, and mistakes in one line."""
 
+import signal
 from pathlib import Path
 
 import numpy as np
@@ -136,7 +137,8 @@ def test_a_target_of_32_bits_is_refused(kind):
         read_picture(Path("grey.tif"))
 
 
-def test_an_interrupted_command_writes_the_best_so_far(command, monkeypatch):
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+def test_an_interrupted_command_writes_the_best_so_far(command, monkeypatch, number):
     class Bar:
         def __enter__(self):
             return self
@@ -146,7 +148,7 @@ def test_an_interrupted_command_writes_the_best_so_far(command, monkeypatch):
 
         def __call__(self, done, total):
             if done == 40:
-                raise KeyboardInterrupt
+                signal.raise_signal(number)
 
     monkeypatch.setitem(cli.design.__globals__, "progress_bar", lambda *_: Bar())
     code, _, error = command(f"design flag.png {OPTIONS}")

@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 
 import mitsuba_diffraction as md
 from mitsuba_diffraction.surface.heightfield import HeightField
-from mitsuba_diffraction.surface.periods import Period, find_periods
+from mitsuba_diffraction.surface.periods import Period, find_periods, repeated
 
 ROOT = Path(__file__).parents[2]
 PIXEL = (0.05, 0.07)
@@ -232,6 +232,16 @@ def test_a_rough_surface_has_no_period():
         heights = np.fft.ifft2(np.fft.fft2(generator.standard_normal(q.shape)) * q**-1.8).real
         found += len(find_periods(HeightField(heights[:100, :90], PIXEL)))
     assert found <= 1
+
+
+def test_no_summit_is_sought_of_the_many_weak_orders_of_a_random_tile(monkeypatch):
+    # Regression: a designed plate has hundreds of them, for which `inspect` took minutes.
+    order = np.fft.fftfreq(160, 1 / 160)
+    inside = np.hypot(order, order[:, None]) < 75
+    noise = np.random.default_rng(5).standard_normal((160, 160))
+    tile = HeightField(np.fft.ifft2(np.fft.fft2(noise) * inside).real, 0.1)
+    monkeypatch.setattr("mitsuba_diffraction.surface.periods._Periodogram.summit", lambda *_: pytest.fail("sought"))
+    assert find_periods(repeated(tile, 2)) == ()
 
 
 def test_jumps_between_the_lines_of_a_scan_are_no_period():
