@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import os
+from pathlib import Path
 from typing import Any
 
 import drjit as dr
@@ -88,12 +90,15 @@ def numbers_from(name: str, file: str, white: float = 1.0, others: str = "") -> 
     `others` are the texts that the parameter may have instead, for the message.
 
     Raises:
-        RequestError: if there is no such file, or it is not a picture.
+        FileNotFoundError: if there is no such file.
+        RequestError: if it is not a picture.
     """
     path = str(mi.file_resolver().resolve(file))
     try:
         bitmap = mi.Bitmap(path)
     except RuntimeError:
+        if Path(file).suffix[1:2].isalpha() and not os.path.exists(path):
+            raise FileNotFoundError(f"{name}: {file}: no such file") from None
         raise RequestError(f"{name}: got {file!r}, wanted {others}a number or the file of a picture") from None
     bitmap.set_srgb_gamma(False)
     numbers = np.array(bitmap.convert(mi.Bitmap.PixelFormat.Y, mi.Struct.Type.Float32, srgb_gamma=False))

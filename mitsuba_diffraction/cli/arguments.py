@@ -14,7 +14,7 @@ import numpy as np
 import typer
 from numpy.typing import NDArray
 
-from ..errors import RequestError, is_number
+from ..errors import RequestError, did_you_mean, is_number
 from ..files.writing import refuse_other_than_utf8
 from ..precomputation.recipe import Recipe, parameters_of_profile, source_named
 from ..progress import say
@@ -255,6 +255,7 @@ def recipe_with(context: typer.Context, name: str, values: dict[str, Value]) -> 
         recipe = Recipe.of_profile(name, values, **of_spectrum)
         known = parameters_of_profile(name)
         unknown, wanted = [*of_scan, *(key for key in values if key not in known)], f"some of {', '.join(known)}"
+        wanted += did_you_mean(unknown[0], known) if unknown else ""
     if unknown:
         raise RequestError(f"{name}: got {', '.join(unknown)}, wanted {wanted}")
     return recipe

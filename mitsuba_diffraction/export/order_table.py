@@ -20,7 +20,7 @@ _JONES = ["to_s_re", "to_s_im", "to_p_re", "to_p_im"]
 _HEADER = """\
 {mark}: orders of a grating
 {what}
-periods {period[0]:.9g} and {period[1]:.9g} um along x and y; z is the outer normal, the medium above is air
+{period}; z is the outer normal, the medium above is air
 theta, phi: light of this polar angle in air travels along (sin theta cos phi, sin theta sin phi, -cos theta)
 m, n: order along x and y; u, v, w: direction cosines along which the order travels, in its own medium of index N:
 N (u, v) = (sin theta cos phi, sin theta sin phi) - wavelength (m, n)/period; w > 0 of reflected, w < 0 of transmitted
@@ -59,7 +59,11 @@ def write_order_table(
     """
     wavelengths, angles, azimuths = checked_ranges(wavelengths, angles, azimuths)
     rigorous = grating.theory == "rigorous"
-    header = (_HEADER + _AMPLITUDES * rigorous).format(mark=MARK, what=grating.description, period=grating.period)
+    x, y = grating.period
+    period = f"period {x:.9g} um along x; grooves along y"
+    if grating.height_field.shape[0] > 1:
+        period = f"periods {x:.9g} and {y:.9g} um along x and y"
+    header = (_HEADER + _AMPLITUDES * rigorous).format(mark=MARK, what=grating.description, period=period)
     count, shape = 0, (len(wavelengths), len(azimuths), len(angles))
     with whole_file(path) as temporary, open(temporary, "w", newline="", encoding="utf-8") as stream:
         stream.writelines(f"# {line}\n" for line in header.splitlines())

@@ -28,6 +28,7 @@ if TYPE_CHECKING:
 POLARISATIONS = ("s", "p")
 _MAX_ROWS, _MAX_COLUMNS = 24, 8  # of a printed table
 _MAX_LINES, _MAX_MAPS = 7, 6  # of a plot
+_MAX_PANELS = 4  # of lines: the angles or the wavelengths up to which there are no maps
 
 
 @dataclass(frozen=True, eq=False)
@@ -119,14 +120,15 @@ class OrderEfficiencies:
             stream.write(f"# {MARK}\n")
 
     def plot(self, path: str | os.PathLike[str] | None = None) -> Figure:
-        """Plot the strongest orders; lines over the wavelength or the angle, or if both vary, a map for each order.
+        """Plot the strongest orders: lines over the wavelength or the angle, or of many of both a map for each order.
 
         Returns the figure, and writes it as PNG, PDF or SVG if a path is given.
         """
         from matplotlib.figure import Figure
 
         figure = Figure(figsize=(9, 5.2), dpi=120, layout="constrained")
-        (self._plot_maps if min(len(self.angles), len(self.wavelengths)) > 1 else self._plot_lines)(figure)
+        has_maps = min(len(self.angles), len(self.wavelengths)) > _MAX_PANELS
+        (self._plot_maps if has_maps else self._plot_lines)(figure)
         figure.suptitle(self.source, fontsize=10)
         if path is not None:
             with whole_file(path) as temporary:
@@ -134,21 +136,22 @@ class OrderEfficiencies:
         return figure
 
     def _plot_lines(self, figure: Figure) -> None:
-        over_wavelengths = len(self.angles) == 1
-        x = self.wavelengths if over_wavelengths else self.angles
-        values = self.values[:, 0] if over_wavelengths else self.values[:, :, 0]
-        axes = figure.add_subplot()
-        for number, index in enumerate(self._strongest(_MAX_LINES)):
-            own = {"color": f"C{number}", "marker": "." if len(x) < 30 else None}
-            axes.plot(x, values[index].mean(axis=-1), **own, label=f"order {_name(self.axes['order'][index])}")
-            axes.plot(x, values[index, :, 0], "--", color=own["color"], lw=0.8)
-            axes.plot(x, values[index, :, 1], ":", color=own["color"], lw=1)
-        axes.plot(x, values.mean(axis=-1).sum(axis=0), color="0.6", label="all orders")
-        axes.plot([], [], "k--", lw=0.8, label="s-polarised")
-        axes.plot([], [], "k:", lw=1, label="p-polarised")
-        axes.set(xlabel=_WAVELENGTH if over_wavelengths else _ANGLE, ylabel="efficiency", ylim=(0, None))
-        fixed = f"{self.angles[0]:g}° incidence" if over_wavelengths else f"{self.wavelengths[0]:g} nm"
-        axes.set_title(f"{fixed}; solid: unpolarised", fontsize=9)
+        over_wavelengths = len(self.angles) <= len(self.wavelengths)
+        x, along, unit = (self.wavelengths, 1, "° incidence") if over_wavelengths else (self.angles, 2, " nm")
+        panels = figure.subplots(1, self.values.shape[along], sharey=True, squeeze=False)[0]
+        fixed = self.angles if over_wavelengths else self.wavelengths
+        for axes, value, values in zip(panels, fixed, np.moveaxis(self.values, along, 0), strict=True):
+            for number, index in enumerate(self._strongest(_MAX_LINES)):
+                own = {"color": f"C{number}", "marker": "." if len(x) < 30 else None}
+                axes.plot(x, values[index].mean(axis=-1), **own, label=f"order {_name(self.axes['order'][index])}")
+                axes.plot(x, values[index, :, 0], "--", color=own["color"], lw=0.8)
+                axes.plot(x, values[index, :, 1], ":", color=own["color"], lw=1)
+            axes.plot(x, values.mean(axis=-1).sum(axis=0), color="0.6", label="all orders")
+            axes.set_xlabel(_WAVELENGTH if over_wavelengths else _ANGLE)
+            axes.set_title(f"{value:g}{unit}", fontsize=9)
+        panels[0].set(ylabel="efficiency", ylim=(0, None))
+        for style, name in (("k-", "unpolarised"), ("k--", "s-polarised"), ("k:", "p-polarised")):
+            axes.plot([], [], style, lw=1, label=name)
         axes.legend(fontsize=8, loc="center left", bbox_to_anchor=(1, 0.5))
 
     def _plot_maps(self, figure: Figure) -> None:

@@ -288,6 +288,7 @@ def test_a_film_on_a_relief_that_transmits_makes_no_light(llvm, film, parameters
 
 
 WRONG = [
+    ({"thin_film_thickness": "nosuch.png"}, "thin_film_thickness: nosuch.png: no such file"),
     ({"thin_film_thickness": -0.1}, "thin_film_thickness: got -0.1, wanted 0 to 4 um"),
     ({"thin_film_thickness": float("nan")}, "thin_film_thickness: got nan, wanted a number"),
     ({"thin_film_thickness": 5.0}, "thin_film_thickness: got 5, wanted 0 to 4 um; a thicker layer is a coat"),

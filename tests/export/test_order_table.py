@@ -162,6 +162,7 @@ def test_the_command_writes_a_table(command, tmp_path, monkeypatch):
     expected = md.efficiencies(md.gratings.blazed(1.2, 0.2), [0, 30], [500, 600], theory="rigorous", material="Al")
     (row,) = chosen(rows, theta_deg=30, wavelength_nm=600, m=1, polarisation="p")
     assert row["efficiency"] == pytest.approx(expected.order(1)[1, 1, 1], rel=1e-6)
+    assert "# period 1.2 um along x; grooves along y; z is" in Path("o.csv").read_text()
     (plane,) = command("export", "sinusoidal,period=1,depth=0", "--wavelength", "500", "--angle", "40", "-o", "f.csv")[
         :1
     ]

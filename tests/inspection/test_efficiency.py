@@ -201,11 +201,16 @@ def test_a_table_is_printed():
     assert len(rows) == 2 + len(one.orders) + len(one.transmitted_orders)
 
 
-@pytest.mark.parametrize(("angles", "panels"), [([0], 1), ([0, 10], 7)])
-def test_a_plot_has_lines_or_a_map_for_each_order(angles, panels, tmp_path):
-    found = md.efficiencies(md.gratings.blazed(2.5, 0.25), angles, [400, 500, 600])
+@pytest.mark.parametrize(("angles", "panels", "maps"), [([0], 1, 0), ([0, 10], 2, 0), (np.linspace(0, 60, 6), 7, 6)])
+def test_a_plot_has_lines_or_of_many_points_a_map_for_each_order(angles, panels, maps, tmp_path):
+    found = md.efficiencies(md.gratings.blazed(2.5, 0.25), angles, [400, 450, 500, 550, 600])
     figure = found.plot(tmp_path / "plot.png")
     assert len(figure.axes) == panels  # with that of the colours
+    assert sum("order" in axes.get_title() for axes in figure.axes) == maps
+    if len(angles) == 2:
+        lines = figure.axes[1].get_lines()
+        np.testing.assert_allclose(lines[-4].get_ydata(), found.unpolarised[:, 1].sum(axis=0))
+        assert figure.axes[0].get_ylim()[1] > found.unpolarised.sum(axis=0).max()
     assert (tmp_path / "plot.png").stat().st_size > 10_000
 
 
@@ -232,6 +237,7 @@ def test_the_command_writes_numbers_and_plot(command, tmp_path, monkeypatch):
     [
         ("efficiency blazd", "blazd: no file and no surface has this name; did you mean blazed?"),
         ("efficiency blazed,depth", "blazed,depth: got 'depth', wanted name=value"),
+        ("efficiency blazed,peroid=2", "largest_height_range, representation, terms, heights_from, tolerance; did you"),
         ("efficiency blazed,depth=1,depth=2", "got 'depth=2', wanted name=value, each name once"),
         ("efficiency blazed --angle 0:60", "--angle: got '0:60', wanted a number"),
         ("efficiency blazed --angle 0:60:-5", "--angle: got '0:60:-5', wanted a number"),

@@ -176,7 +176,7 @@ def test_a_missing_file_is_a_missing_file(tmp_path):
 @pytest.mark.parametrize("name", ["scan.text", "scan", "scan.png.bak"])
 def test_an_unknown_extension_is_refused_with_the_known_ones(tmp_path, refuse, name):
     (tmp_path / name).write_bytes(b"1 2 3")
-    refuse(name, r"wanted one of \.npy, \.npz, \.png, \.tif, \.tiff")
+    refuse(name, r"wanted one of \.npy, \.npz, \.png, \.tif, \.tiff.*TrueMap \.tmd and others")
 
 
 @pytest.mark.parametrize("name", ["scan.npy", "scan.png", "scan.tif", "scan.gsf", "scan.gwy", "scan.asc", "grid.asc"])

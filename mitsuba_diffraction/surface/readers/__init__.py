@@ -8,6 +8,7 @@ explicit y (.xyz, ESRI grids) keep theirs.
 from __future__ import annotations
 
 import os
+import textwrap
 import warnings
 from dataclasses import replace
 from pathlib import Path
@@ -24,7 +25,7 @@ from .scan import Scan, micrometres, pair
 
 __all__ = ["read_height_field"]
 
-_MAX_QUOTE = 300  # characters of a library's error message, as some quote a damaged header in full
+_MAX_QUOTE = 500  # characters of a library's error message, as some quote a damaged header in full
 _WITHOUT_UNIT = {
     ".npy": images.read_npy,
     ".npz": images.read_npz,
@@ -160,7 +161,7 @@ def read_height_field(
         _check_scale(field, not keep_missing, _RANGE if integers else _UNITS)
     # Pillow raises OSError for a damaged image, the system for unreadable paths (a folder, permissions).
     except (RequestError, OSError, MemoryError) as error:
-        raise RequestError(" ".join(f"{path}: {str(error)[:_MAX_QUOTE]}".split())) from error
+        raise RequestError(f"{path}: {textwrap.shorten(str(error), _MAX_QUOTE, placeholder=' …')}") from error
     if doubt:
         warnings.warn(f"{source}: {doubt}; pixel_size (--pixel-size), in µm, sets another scale", stacklevel=2)
     return field
