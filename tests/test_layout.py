@@ -237,7 +237,7 @@ md.view("blazed", depth=0.02, samples=32, coherence_length=2.0)
 np = sys.modules["numpy"]
 np.save({str(tmp_path / "scan.npy")!r}, np.random.default_rng(0).random((40, 40)))
 from mitsuba_diffraction.cli import main
-sys.argv = ["", "inspect", {str(tmp_path / "scan.npy")!r}, "--pixel-size", "0.1", "-o", {str(tmp_path / "s.png")!r}]
+sys.argv = ["", "inspect", {str(tmp_path / "scan.npy") + ",pixel_size=0.1"!r}, "-o", {str(tmp_path / "s.png")!r}]
 try:
     main()
 except SystemExit as exit:

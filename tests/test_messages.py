@@ -76,7 +76,7 @@ def test_messages_name_what_is_available(body, parameters, words, tmp_path, llvm
         ("convergence scenes/blaze.xml -o out.png", "shader knows no other; choose -D light=bulb or -D light=parallel"),
         ("render scenes/blaze.blend", "got a file of Blender, wanted a scene (.xml), which Mitsuba-Blender exports"),
         ("render moved/scan.xml", "moved/scan.xml: no such file; mitsuba-diffraction examples writes it"),
-        ("inspect scan.png --hight-range 1", "(try mitsuba-diffraction inspect --help)"),
+        ("inspect scan.png --jason a.json", "(try mitsuba-diffraction inspect --help)"),
         (
             "render scenes/lights",
             "wanted a scene (.xml); this folder holds bulb.xml, desk_lamp.xml, lamp.xml, lamps.xml, "

@@ -302,16 +302,14 @@ def _from_file(props: mi.Properties, media: Media, scale: float) -> Spectrum | R
     given = _requested(props)
     if not path.suffix:
         path = Path(source_named(str(path)))
-        if str(path) in PROFILES:
-            return _inside(media, scale, Recipe.of_profile(str(path), given))
     suffix = path.suffix.lower()
     if suffix in (".toml", ".exr") and not path.is_file():
         # An unresolved path is relative; the resolver begins with the folder of the scene.
         folder = Path(str(mi.file_resolver()[0])) / path.parent
         available = sorted(other.name for other in folder.glob("*") if other.suffix.lower() in (".exr", ".toml"))
         raise FileNotFoundError(f"{path}: no such file; {folder} holds {', '.join(available) or 'no spectrum'}")
-    if suffix == ".toml":
-        return _inside(media, scale, Recipe.load(path, **given))
+    if suffix == ".toml" or str(path) in PROFILES:
+        return _inside(media, scale, Recipe.of_source(str(path), given))
     if suffix == ".exr":
         _refuse_requested(props, str(path))
         return load_spectrum(path)

@@ -24,8 +24,9 @@ from ..inverse_design.output import SUFFIXES, save
 from ..inverse_design.plate import for_detail, resolved_strokes
 from ..inverse_design.search import WHITE
 from ..inverse_design.target import finest_strokes
+from ..precomputation.surface_text import converted
 from ..progress import bytes_text, progress_bar, say, show, table, tell
-from .arguments import Overwrite, check_suffix, converted, named_as_options, parse_numbers
+from .arguments import Overwrite, check_suffix, named_as_options, parse_numbers
 from .render import Stopped
 
 _MIN_SAID_TIME = 90.0  # s, that a search takes

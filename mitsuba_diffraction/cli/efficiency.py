@@ -9,53 +9,35 @@ from typing import Annotated, Any
 import typer
 
 from ..errors import RequestError
+from ..export.exported_grating import material_of
 from ..files.outputs import check_outputs
 from ..inspection.efficiency import OrderEfficiencies, efficiencies
 from ..inspection.peaks import check_request, peak_efficiencies
 from ..precomputation.grating_spectrum import GratingSpectrum
 from ..precomputation.spectra import load_spectrum
+from ..precomputation.surface_text import parsed
 from ..progress import progress_bar, tell
 from ..scalar_theory.validity import scalar_error
 from ..settings import ScalarSettings
-from .arguments import (
-    Overwrite,
-    angles_of,
-    check_suffix,
-    converted,
-    parse_numbers,
-    recipe_with,
-    surface_of,
-    takes_scan,
-)
+from .arguments import KEYS_OF_RECIPES, SURFACE, Overwrite, angles_of, check_suffix, parse_numbers, recipe_of
+
+_OF_LIGHT = ("theory", "transmission", "material", "int_ior")  # besides the surface
 
 
-@takes_scan
 def efficiency(
-    context: typer.Context,
-    source: Annotated[
+    surface: Annotated[
         str,
         typer.Argument(
-            metavar="SURFACE[,name=value…]",
-            help="a recipe (.toml), a profile, a scan, or a saved spectrum (.exr) of an irregular surface",
+            metavar=SURFACE,
+            help="a recipe (.toml), a profile, a scan, or a saved spectrum (.exr) of an irregular surface; "
+            f"{KEYS_OF_RECIPES}, theory, material (a conductor) or int_ior (default: 1.5), and transmission (none, "
+            "interface, sheet)",
         ),
     ],
     angle: Annotated[
         str, typer.Option(help="angle of incidence, degrees: a number, several (0,30), or first:last:step")
     ] = "0",
     wavelength: Annotated[str, typer.Option(help="nm: a number, several, or first:last:step")] = "400:700:50",
-    theory: Annotated[
-        str | None, typer.Option(help="scalar or rigorous; default: that of the recipe, or scalar")
-    ] = None,
-    material: Annotated[
-        str | None, typer.Option(help="a conductor, as Mitsuba names it; default: that of the recipe, or n = 1.5")
-    ] = None,
-    int_ior: Annotated[
-        str | None, typer.Option(help="the index of a dielectric instead: a number, a name such as BK7, or a file")
-    ] = None,
-    transmission: Annotated[
-        str | None,
-        typer.Option(help="none, or transmitted orders, too: interface or sheet; default: that of the recipe, or none"),
-    ] = None,
     azimuth: Annotated[
         float, typer.Option(help="azimuth of the plane of incidence, degrees from x; 90: along the grooves")
     ] = 0,
@@ -65,14 +47,13 @@ def efficiency(
 ) -> None:
     """Compute how much light goes into each order of a grating, or each spectral peak of an irregular surface."""
     angles, wavelengths = angles_of("--angle", angle), parse_numbers("--wavelength", wavelength)
-    name, values = surface_of(source)
-    recipe = recipe_with(context, name, values)
+    name, values = parsed(surface)
+    given = {key: values.pop(key) for key in _OF_LIGHT if key in values}
+    recipe = recipe_of(name, values)
     settings = ScalarSettings() if recipe is None else recipe.settings
-    chosen = settings.chosen
-    theory, transmission = theory or settings.theory, transmission or chosen.get("transmission", "none")
-    index: complex | str | None = None if int_ior is None else converted(int_ior)
-    if material is None and int_ior is None:
-        material, index = chosen.get("material"), chosen.get("int_ior")
+    chosen = {"theory": "scalar", "transmission": "none", **settings.chosen}
+    theory, transmission = (given.get(key, chosen[key]) for key in _OF_LIGHT[:2])
+    material, int_ior = material_of(chosen, given)
     if csv is not None:
         check_suffix("--csv", csv, ".csv")
     if plot is not None:
@@ -84,15 +65,15 @@ def efficiency(
         raise RequestError(
             f"{name}: got theory {theory}, transmission {transmission} of an irregular surface, wanted scalar, none"
         )
-    material_of: dict[str, Any] = {"material": material, "int_ior": index, "azimuth": azimuth}
+    light: dict[str, Any] = {"material": material, "int_ior": int_ior, "azimuth": azimuth}
     found: OrderEfficiencies
     if recipe is None or irregular:
-        check_request(settings.wavelengths, angles, wavelengths, material, index)  # before a spectrum is computed
+        check_request(settings.wavelengths, angles, wavelengths, material, int_ior)  # before a spectrum is computed
         cached = load_spectrum(name) if recipe is None else recipe.cached(partial(progress_bar, unit="%"))
         if not isinstance(cached, GratingSpectrum):
             raise RequestError(f"{name}: got a spectrum of rigorous theory, wanted its recipe")
         with progress_bar(f"peaks of {name}") as progress:
-            found = peak_efficiencies(cached, angles, wavelengths, **material_of, progress=progress)
+            found = peak_efficiencies(cached, angles, wavelengths, **light, progress=progress)
         warning = cached.warning
     else:
         with progress_bar(f"efficiencies of {name}") as progress:
@@ -102,13 +83,13 @@ def efficiency(
                 wavelengths,
                 theory=theory,
                 transmission=transmission,
-                **material_of,
+                **light,
                 progress=progress,
             )
             warning = scalar_error(recipe.height_field()).warning if theory == "scalar" else ""
     tell(str(found))
     if warning:
-        tell(f"! {warning.replace('theory=rigorous', '--theory rigorous')}")
+        tell(f"! {warning}")
     if csv is not None:
         found.save_csv(csv)
         tell(f"{csv}: all numbers")

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from functools import partial
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Any
 
 import typer
 
@@ -17,19 +17,10 @@ from ..files.outputs import check_outputs
 from ..precomputation.grating_spectrum import GratingSpectrum
 from ..precomputation.recipe import Recipe, theory_in
 from ..precomputation.spectra import load_spectrum
+from ..precomputation.surface_text import parsed
 from ..progress import progress_bar, say, tell
 from ..scalar_theory.validity import scalar_error
-from .arguments import (
-    Overwrite,
-    Value,
-    angles_of,
-    check_suffix,
-    is_film,
-    parse_numbers,
-    recipe_with,
-    surface_of,
-    takes_scan,
-)
+from .arguments import KEYS_OF_RECIPES, SURFACE, Overwrite, angles_of, check_suffix, is_film, parse_numbers, recipe_of
 
 _OF_MATERIAL = ("theory", "material", "int_ior")
 _INPUTS = {"orientation": "Orientation", "height_scale": "HeightScale", "base": "BaseColor"}  # of the shader
@@ -40,15 +31,13 @@ _RANGES = {
 }
 
 
-@takes_scan
 def export(
-    context: typer.Context,
-    source: Annotated[
+    surface: Annotated[
         str,
         typer.Argument(
-            metavar="SURFACE[,name=value…]",
-            help="a recipe (.toml), a profile, a scan, or for .osl a saved spectrum (.exr); name=value: theory, "
-            "material, int_ior, and the parameters of a profile",
+            metavar=SURFACE,
+            help="a recipe (.toml), a profile, a scan, or for .osl a saved spectrum (.exr); "
+            f"{KEYS_OF_RECIPES}, theory, material, int_ior",
         ),
     ],
     output: Annotated[
@@ -73,13 +62,15 @@ def export(
     overwrite: Overwrite = False,
 ) -> None:
     """Write a surface for another program."""
-    name, values = surface_of(source)
+    name, values = parsed(surface)
     check_suffix("-o", output, ".osl", *_RANGES)
     ranges = {"wavelength": wavelength, "angle": angle, "azimuth": azimuth}
     given = {key: text for key, text in ranges.items() if text is not None}
     parameters = {key: values.pop(key) for key in _OF_MATERIAL if key in values}
     _refuse_parameters_of_scenes(values, output)
-    title, recipe = source.partition(",")[0], recipe_with(context, name, values)
+    # A recipe of the package keeps its name.
+    title = name if surface.startswith(name) else surface.partition(",")[0]
+    recipe = recipe_of(name, values)
     check_outputs([Path(name), *(recipe.files if recipe else [])], [("-o", output)], overwrite=overwrite)
     if output.suffix.lower() == ".osl":
         if given:
@@ -91,7 +82,7 @@ def export(
         _write_orders(title, recipe, parameters, output, given)
 
 
-def _refuse_parameters_of_scenes(values: dict[str, Value], output: Path) -> None:
+def _refuse_parameters_of_scenes(values: dict[str, Any], output: Path) -> None:
     """Refuse parameters of the plugin that files for other programs do not hold, and say what does."""
     is_shader = output.suffix.lower() == ".osl"
     for key in _IN_SCENES:
@@ -101,7 +92,7 @@ def _refuse_parameters_of_scenes(values: dict[str, Value], output: Path) -> None
             raise RequestError(f"{key}: got {values[key]}, which {output} does not hold; {instead}")
 
 
-def _write_shader(title: str, recipe: Recipe | None, parameters: dict[str, Value], output: Path) -> None:
+def _write_shader(title: str, recipe: Recipe | None, parameters: dict[str, Any], output: Path) -> None:
     theory = parameters.pop("theory", recipe.settings.theory if recipe else theory_in(Path(title)))
     if theory != "scalar":
         raise RequestError(
@@ -120,9 +111,7 @@ def _write_shader(title: str, recipe: Recipe | None, parameters: dict[str, Value
     tell(f"{output}: {spectrum.source}; {held}")
 
 
-def _write_orders(
-    title: str, recipe: Recipe, parameters: dict[str, Value], output: Path, given: dict[str, str]
-) -> None:
+def _write_orders(title: str, recipe: Recipe, parameters: dict[str, Any], output: Path, given: dict[str, str]) -> None:
     suffix = output.suffix.lower()
     ranges = _RANGES[suffix] | given
     wavelengths, angles = parse_numbers("--wavelength", ranges["wavelength"]), angles_of("--angle", ranges["angle"])

@@ -17,29 +17,21 @@ from ..files.outputs import check_outputs, free_name, plain, save_json
 from ..inspection import Inspection, save_picture
 from ..inspection import inspect as look
 from ..inspection.predicted_colours import GREEN, Colour, colours_at
-from ..precomputation.recipe import source_named
+from ..precomputation.recipe import Recipe
+from ..precomputation.surface_text import parsed
 from ..progress import progress_bar, show, table, tell
 from ..settings import SUN_COHERENCE_LENGTH, lobe_width
-from .arguments import (
-    Overwrite,
-    angles_of,
-    check_suffix,
-    options_of_scan,
-    recipe_of,
-    settings_of,
-    takes_scan,
-)
+from .arguments import KEYS_OF_RECIPES, SURFACE, Overwrite, angles_of, check_suffix
 
 
-@takes_scan
 def inspect(
-    context: typer.Context,
-    source: Annotated[Path, typer.Argument(metavar="SURFACE", help="a scan, a recipe (.toml), or a profile")],
+    surface: Annotated[
+        str, typer.Argument(metavar=SURFACE, help=f"a scan, a recipe (.toml), or a profile; {KEYS_OF_RECIPES}")
+    ],
     output: Annotated[
         Path | None,
         typer.Option("-o", "--output", help="figure (.png, .pdf, .svg); default: ./NAME_inspect.png"),
     ] = None,
-    plane: Annotated[bool, typer.Option("--plane", help="level the scan first, as --prepare level_plane does")] = False,
     angle: Annotated[
         str, typer.Option(help="angle of incidence for --view, degrees: a number, several (0,30), or first:last:step")
     ] = "0",
@@ -54,8 +46,8 @@ def inspect(
     angles, views = angles_of("--angle", angle), np.zeros(0) if view is None else angles_of("--view", view)
     if view is None and angle != "0":
         raise RequestError(f"--angle: got {angle} without --view, wanted the angles of the viewer, too")
-    source = Path(source_named(str(source)))
-    recipe = recipe_of(source, options_of_scan(context), settings_of(context))
+    name, values = parsed(surface)
+    source, recipe = Path(name), Recipe.of_source(name, values)
     reads = [source, *recipe.files]
     default_name = free_name(f"{source.stem}_inspect", lambda stem: [Path(f"{stem}.png")], reads)
     picture = output or Path(f"{default_name}.png")
@@ -125,7 +117,7 @@ def _diffraction_lines(inspection: Inspection) -> list[tuple[str, str]]:
         name = "period" if number == 0 else "another period"
         lines.append((name, f"{period}; {period.strength:.1%} of the variance"))
     if not inspection.periods:
-        hint = " (for a single period of a grating: --extent tile)" if inspection.extent == "sample" else ""
+        hint = " (for a single period of a grating: extent=tile)" if inspection.extent == "sample" else ""
         lines.append(("period", f"none stands out{hint}"))
     else:
         sines = [order * GREEN / inspection.periods[0].period for order in range(1, 4)]

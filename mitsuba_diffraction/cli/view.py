@@ -5,41 +5,26 @@ from __future__ import annotations
 import functools
 import webbrowser
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated
 
 import typer
 
-from ..errors import shell_command
 from ..files.outputs import check_outputs
 from ..files.writing import whole_file
-from ..precomputation.recipe import Recipe
-from ..progress import NAME, bytes_text, progress_bar, say, tell
+from ..precomputation.surface_text import parsed
+from ..progress import bytes_text, progress_bar, say, tell
 from ..viewer.page import page, reference_picture
 from ..viewer.viewed_surface import Surface
-from .arguments import (
-    SCAN_OPTIONS,
-    Overwrite,
-    check_suffix,
-    given_of,
-    is_film,
-    is_scan,
-    options_of_scan,
-    recipe_of,
-    settings_of,
-    surface_of,
-    takes_scan,
-)
+from .arguments import KEYS_OF_RECIPES, SURFACE, Overwrite, check_suffix, is_film
 
 
-@takes_scan
 def view(
-    context: typer.Context,
     sources: Annotated[
         list[str],
         typer.Argument(
-            metavar="SURFACE[,name=value…]…",
-            help="a recipe (.toml), a saved spectrum (.exr), a profile, or a scan; name=value: material, int_ior, "
-            "coat_ior, orientation, height_scale, and the parameters of a profile; several are a list in one page",
+            metavar=SURFACE,
+            help=f"a recipe (.toml), a saved spectrum (.exr), a profile, or a scan; {KEYS_OF_RECIPES}, material, "
+            "int_ior, coat_ior, orientation, height_scale; several are a list in one page",
         ),
     ],
     output: Annotated[
@@ -52,25 +37,19 @@ def view(
     overwrite: Overwrite = False,
 ) -> None:
     """Write a page that shades surfaces live in the browser (WebGL2), without network."""
-    requests = [surface_of(source) for source in sources]
+    requests = [parsed(source) for source in sources]
     stem = Path(requests[0][0]).stem or "view"
     target = output or Path(stem if len(requests) == 1 else "surfaces").with_suffix(".html")
     check_suffix("-o", target, ".html")
-    of_scan, settings = options_of_scan(context), settings_of(context)
-    # The options of a scan do not apply to the other surfaces.
-    has_scan = any(is_scan(name) for name, _ in requests)
-    recipes = [
-        recipe_of(Path(name), of_scan, settings) if is_scan(name) or ((of_scan or settings) and not has_scan) else None
-        for name, _ in requests
-    ]
     reads = [file for file in (*(Path(name) for name, _ in requests), reference) if file is not None and file.exists()]
-    files = [file for recipe in recipes if recipe is not None for file in recipe.files]
-    check_outputs([*reads, *files], [("-o", target)], overwrite=overwrite)
+    check_outputs(reads, [("-o", target)], overwrite=overwrite)
     picture = None if reference is None else reference_picture(reference)
-    surfaces = [
-        _surface(context, name, parameters, recipe)
-        for (name, parameters), recipe in zip(requests, recipes, strict=True)
-    ]
+    for name, _ in requests:
+        if is_film(name):
+            shown = "the page shows the light that it reflects; `render` shows the light that a film transmits"
+            say("note", f"{name}: {shown}")
+    progress = functools.partial(progress_bar, unit="%")
+    surfaces = [Surface.named(name, values, progress) for name, values in requests]
     text = page(*surfaces, picture=picture)
     with whole_file(target) as temporary:
         temporary.write_text(text, encoding="utf-8")
@@ -80,29 +59,3 @@ def view(
     tell(f"open {address} in a browser")
     if open_page:
         webbrowser.open(address)
-
-
-def _surface(context: typer.Context, name: str, parameters: dict[str, Any], recipe: Recipe | None) -> Surface:
-    """Return the surface of one argument; a recipe is given for a scan, or for other settings."""
-    path, progress = Path(name), functools.partial(progress_bar, unit="%")
-    if is_film(name):
-        say(
-            "note", f"{name}: the page shows the light that it reflects; `render` shows the light that a film transmits"
-        )
-    if recipe is None:
-        return Surface.named(name, parameters, progress)
-    spectrum = f"{path.stem}.exr"
-    extent = {"extent": recipe.settings.extent} if is_scan(name) else {}
-    options = _words(given_of(context, SCAN_OPTIONS) | extent)
-    command = shell_command(NAME, "precompute", path.name, *options, "-o", spectrum)
-    return Surface.of_recipe(recipe, path.stem, {"filename": spectrum}, parameters, progress, command)
-
-
-def _words(options: dict[str, Any]) -> list[str]:
-    """Return options of the command line as words."""
-    words = []
-    for name, value in options.items():
-        option = f"--{name.replace('_', '-')}"
-        for item in value if isinstance(value, list | tuple) else [value]:
-            words += [option] if item is True else [option, str(item)]
-    return words

@@ -298,7 +298,7 @@ def concerns(
         found.append(
             f"The scan is {width:.3g} µm wide, {width / _GREEN:.2g} wavelengths of green light: an order is "
             f"±{lobe:.2g}° wide, and colours run into each other. Scan 20 µm or more, or, for whole periods of a "
-            "grating, use --extent tile."
+            "grating, use extent=tile."
         )
     noise = white_noise(height_field.heights)
     if noise > _MAX_NOISE * numbers.Sq:
@@ -311,7 +311,7 @@ def concerns(
     if shift > lobe_width(coherence_length) or 2 * numbers.tilt > _MAX_DEFLECTION:
         found.append(
             f"The scan is tilted by {numbers.tilt:.2g}° ({numbers.tilt_height * 1e3:.0f} nm from corner to corner), "
-            f"which deflects all reflected light by {2 * numbers.tilt:.2g}°. Level it: --prepare level_plane."
+            f"which deflects all reflected light by {2 * numbers.tilt:.2g}°. Level it: prepare=level_plane."
         )
     at_limit = _fraction_at_limit(height_field)
     if at_limit > _MAX_FRACTION_AT_LIMIT:

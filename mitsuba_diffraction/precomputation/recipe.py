@@ -27,6 +27,8 @@ fill_missing = true              # interpolate missing pixels; default: refuse t
 [spectrum]                       # the parameters of settings.py, all optional
 extent = "tile"
 wavelengths = [360.0, 830.0]     # nm
+
+On the command line, the same names follow the name of a profile, a recipe or a scan (surface_text.py).
 """
 
 from __future__ import annotations
@@ -63,8 +65,8 @@ if sys.version_info >= (3, 11):
 else:
     import tomli as tomllib
 
-_SCAN_KEYS = frozenset({"scan", "pixel_size", "height_range", "fill_missing", "channel", "unit", "prepare"})
-_SPECTRUM_KEYS = frozenset(SPECTRUM_PARAMETERS)
+SCAN_KEYS = ("pixel_size", "height_range", "fill_missing", "channel", "unit", "prepare")
+FLAGS = ("fill_missing", "polarised")  # true or false
 REQUESTED = "representation", "terms", "heights_from", "tolerance"  # of a spectrum; they may override a recipe's
 _OF_PROFILE = "coherence_length", "largest_height_range", *REQUESTED
 MAX_PATCHES = 1000  # of which the mean has three per cent of the speckle of one patch
@@ -136,7 +138,7 @@ class Recipe:
                     f"patches: got {patches!r} of the profile {self.surface['profile']!r}, wanted a profile with a seed"
                 )
         if "scan" in self.surface:
-            _refuse_unknown("[surface]", self.surface, _SCAN_KEYS)
+            _refuse_unknown("[surface]", self.surface, frozenset({"scan", *SCAN_KEYS}))
             if not isinstance(self.surface["scan"], str):
                 raise RequestError(f"scan: got {self.surface['scan']!r}, wanted a file name")
             check_steps(plain.pop("prepare", []))
@@ -163,6 +165,40 @@ class Recipe:
         return cls({"profile": name, **given}, Settings.of(**{**default, **of_spectrum, **settings}))
 
     @classmethod
+    def of_source(cls, source: str, values: Mapping[str, Any] | None = None, extent: str = "sample") -> Recipe:
+        """Return the recipe of a profile, in a file (.toml), or of a scan, with values in the place of its own.
+
+        Args:
+            source: the name of the profile, or the file.
+            values: by the names that they have in a recipe, under `[surface]` and `[spectrum]`.
+            extent: of a scan, where `values` have none.
+
+        Raises:
+            FileNotFoundError: if there is no such recipe.
+            ValueError: if it or a value is wrong, or unknown.
+        """
+        given = dict(values or {})
+        settings = {name: given.pop(name) for name in SPECTRUM_PARAMETERS if name in given}
+        path = Path(source)
+        if source in PROFILES:
+            recipe = cls.of_profile(source, {}, **settings)
+        elif path.suffix.lower() == ".toml":
+            recipe = cls.load(path, **settings)
+        else:
+            recipe = cls({"scan": path.name}, Settings.of(**{"extent": extent, **settings}), path.parent)
+        if unknown := [name for name in given if name not in recipe.known]:
+            similar = did_you_mean(unknown[0], recipe.known)
+            raise RequestError(f"{source}: got {', '.join(unknown)}, wanted some of {', '.join(recipe.known)}{similar}")
+        return cls({**recipe.surface, **given}, recipe.settings, recipe.folder)
+
+    @property
+    def known(self) -> tuple[str, ...]:
+        """The names of the values that a recipe of such a surface may have, but for `scan` and `profile`."""
+        is_scan = "scan" in self.surface
+        own = SCAN_KEYS if is_scan else (*inspect.signature(PROFILES[self.surface["profile"]]).parameters, "patches")
+        return (*own, *SPECTRUM_PARAMETERS)
+
+    @classmethod
     def load(cls, path: str | os.PathLike[str], **settings: Any) -> Recipe:
         """Read a recipe; `settings`, by their names, override its own under `[spectrum]`.
 
@@ -187,7 +223,7 @@ class Recipe:
             of_files = {name for name in ("material", "int_ior") if is_file(spectrum.get(name))}
             folder = path.parent.absolute()
             spectrum = {**spectrum, **{name: str(folder / spectrum[name]) for name in of_files}, **settings}
-            _refuse_unknown("[spectrum]", spectrum, _SPECTRUM_KEYS)
+            _refuse_unknown("[spectrum]", spectrum, frozenset(SPECTRUM_PARAMETERS))
             _refuse_other_values(spectrum)
             return cls(surface, Settings.of(**spectrum), folder)
         except RequestError as error:
@@ -348,7 +384,7 @@ def _refuse_unknown(where: str, table: Mapping[str, Any], known: frozenset[str])
 
 def _refuse_other_values(table: Mapping[str, Any]) -> None:
     for name, value in table.items():
-        if isinstance(value, bool) and name not in ("fill_missing", "polarised"):
+        if isinstance(value, bool) and name not in FLAGS:
             raise RequestError(f"{name}: got {value!r}, wanted a number or a text")
         if not (_is_plain(value) or (isinstance(value, list | tuple) and all(_is_plain(v) for v in value))):
             raise RequestError(f"{name}: got {value!r}, wanted a number, a text, or a list of them")

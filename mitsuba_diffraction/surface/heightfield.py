@@ -145,7 +145,7 @@ def _refuse(gaps: NDArray[np.bool_]) -> None:
         raise RequestError(
             f"heights: {gaps.sum()} of {gaps.size} pixels are missing or not finite, "
             f"the first at row {row}, column {column}; wanted finite heights in µm "
-            "(fill_missing=True, or --fill-missing, fills them from their surroundings)"
+            "(fill_missing=True fills them from their surroundings)"
         )
 
 

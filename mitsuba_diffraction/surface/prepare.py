@@ -370,7 +370,6 @@ _STEPS: dict[str, tuple[Callable[..., HeightField], Callable[[Any], bool], str]]
 }
 """Name → function, check of an argument, and description of a valid argument."""
 
-STEP_NAMES = tuple(_STEPS)
 _ARGUMENT_REQUIRED = ("rotate", "trim_edges")  # the others have no argument, or a default
 
 

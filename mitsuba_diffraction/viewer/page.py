@@ -92,7 +92,7 @@ def _suggestion(surface: Surface, factor: float) -> str:
     """Return an option that makes the table of a sample smaller by a factor, as the end of a message, or ""."""
     # The nodes of a sample lie as densely as its lobes are narrow, along both axes.
     length = 0.9 * surface.spectrum.coherence_length * max(factor, 0) ** 0.5
-    return f": --coherence-length {length:.2g}" if surface.spectrum.extent == "sample" else ""
+    return f": coherence_length={length:.2g}" if surface.spectrum.extent == "sample" else ""
 
 
 def reference_picture(path: str | os.PathLike[str]) -> NDArray[np.float16]:

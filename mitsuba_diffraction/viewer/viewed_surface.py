@@ -11,13 +11,14 @@ from typing import Any
 
 import numpy as np
 
-from ..errors import RequestError, did_you_mean, is_number
+from ..errors import RequestError, did_you_mean, is_number, shell_command
 from ..files.writing import examples_folder
 from ..optics.materials import refractive_index
 from ..precomputation.grating_spectrum import GratingSpectrum
 from ..precomputation.recipe import Recipe, parameters_of_profile, source_named
 from ..precomputation.spectra import Spectrum, load_spectrum
-from ..progress import Progress, no_progress
+from ..precomputation.surface_text import written
+from ..progress import NAME, Progress, no_progress
 from ..settings import FROM_RADIUS, VISIBLE, wavelengths_inside
 from ..spectrum.tables import SliceTable
 from ..surface.gratings import PROFILES
@@ -164,11 +165,11 @@ class Surface:
         parameters: Mapping[str, Any],
         progress: Callable[[str], AbstractContextManager[Progress]] = no_progress,
     ) -> Surface:
-        """Return the surface of a recipe (.toml), a saved spectrum (.exr) or a profile.
+        """Return the surface of a recipe (.toml), a saved spectrum (.exr), a profile or a scan.
 
         Args:
             source: the file, or the name of the profile.
-            parameters: of the material, and of the profile and its spectrum.
+            parameters: of the material, and what a recipe of the surface may say (`Recipe.known`).
             progress: of the computation.
 
         Raises:
@@ -179,27 +180,28 @@ class Surface:
         if path.suffix.lower() == ".exr":
             material = material_from(values)
             return cls(path.stem, load_spectrum(path), None, {"filename": path.name}, material)  # type: ignore[arg-type]
-        if path.suffix.lower() == ".toml":
-            recipe = Recipe.load(path)
-            # A recipe of the package has its name in a scene, wherever the scene lies.
-            of_package = path.resolve().parent == (examples_folder() / "precompute").resolve()
-            filename = path.stem if of_package else path.name
-            return cls.of_recipe(recipe, path.stem, {"filename": filename}, values, progress=progress)
-        name = str(path)
-        if name not in PROFILES:
-            raise RequestError(
-                f"surface: got {name!r}, wanted a recipe (.toml), a saved spectrum (.exr), a scan with its scale, or a "
-                f"profile ({', '.join(PROFILES)})"
-            )
-        known = parameters_of_profile(name)
         if (theory := values.pop("theory", "scalar")) != "scalar":
             raise RequestError(f"theory: got {theory}, wanted scalar")
-        grating = {key: values.pop(key) for key in known if key in values}
-        recipe = Recipe.of_profile(name, grating)
-        return cls.of_recipe(recipe, name, {"profile": name, **grating}, values, progress=progress, known=known)
+        known = tuple(name for name in Recipe.of_source(str(path)).known if name not in _OF_SCENE)
+        own = {name: values.pop(name) for name in known if name in values}
+        recipe, command = Recipe.of_source(str(path), own), ""
+        grating: dict[str, Any]
+        if str(path) in PROFILES and own.keys() <= set(parameters_of_profile(str(path))):
+            grating = {"profile": str(path), **own}
+        elif path.suffix.lower() == ".toml" and not own:
+            # A recipe of the package has its name in a scene, wherever the scene lies.
+            of_package = path.resolve().parent == (examples_folder() / "precompute").resolve()
+            grating = {"filename": path.stem if of_package else path.name}
+        else:
+            grating = {"filename": f"{path.stem}.exr"}
+            extent = {} if path.suffix.lower() == ".toml" else {"extent": recipe.settings.extent}
+            surface = written(path.name, own | extent)
+            command = shell_command(NAME, "precompute", surface, "-o", f"{path.stem}.exr")
+        return cls.of_recipe(recipe, path.stem, grating, values, progress, command, known)
 
 
 SHORTEST = VISIBLE[0]  # nm, of the wavelengths of a page
+_OF_SCENE = {*_NOT_SHOWN, *(field.name for field in fields(ViewedMaterial))}
 
 
 def _with_plastic(recipe: Recipe, parameters: Mapping[str, Any], covered: bool) -> dict[str, Any]:

@@ -456,15 +456,15 @@ def test_precompute_writes_a_recipes_rigorous_spectrum(command, tmp_path):
     assert "int_ior 1.5, rigorous theory" in out
     saved = RigorousSpectrum.load(target)
     assert (saved.material_name, saved.mueller) == ("int_ior 1.5", None)
-    # Options stand in for the recipe's.
+    # Values stand in for the recipe's.
     scalar = tmp_path / "scalar.toml"
     scalar.write_text('[surface]\nprofile = "sinusoidal"\nperiod = 0.19\ndepth = 0.05\nsamples = 32\n')
-    options = ("--theory", "rigorous", "--material", "Al", "--ext-ior", "1.5", "--polarised", "--tolerance", "0.9")
-    code, out, _ = command("precompute", str(scalar), "-o", str(tmp_path / "metal.exr"), *options)
+    values = "theory=rigorous,material=Al,ext_ior=1.5,polarised=true,tolerance=0.9"
+    code, out, _ = command("precompute", f"{scalar},{values}", "-o", str(tmp_path / "metal.exr"))
     assert code == 0
     assert "material Al below ext_ior 1.5, rigorous theory" in out
     assert "Mueller matrices, mean " in RigorousSpectrum.load(tmp_path / "metal.exr").details
-    code, _, err = command("precompute", str(scalar), "-o", str(tmp_path / "gone.exr"), "--theory", "vector")
+    code, _, err = command("precompute", f"{scalar},theory=vector", "-o", str(tmp_path / "gone.exr"))
     assert (code, len(err.splitlines())) == (2, 1)
     assert "theory: got 'vector', wanted one of scalar, rigorous" in err
     content = bytearray(target.read_bytes())

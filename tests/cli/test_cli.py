@@ -62,25 +62,28 @@ def files():
         ("frobnicate", "frobnicate"),
         ("precompute", "Missing argument"),
         ("precompute gone.toml", "gone.toml"),
-        ("precompute gone.npy --pixel-size 0.1", "gone.npy"),
+        ("precompute gone.npy,pixel_size=0.1", "gone.npy"),
         ("precompute .", ""),
         ("precompute blaze.toml --colour red", "--colour"),
-        ("precompute blaze.toml --tolerance fine", "--tolerance"),
-        ("precompute blaze.toml --tolerance 7", "tolerance: got 7"),
-        ("precompute blaze.toml --tolerance nan", "tolerance: got nan"),
-        ("precompute blaze.toml --coherence-length -3", "coherence_length: got -3"),
-        ("precompute blaze.toml --representation wavelets", "representation: got 'wavelets'"),
-        ("precompute blaze.toml --extent ribbon", "extent: got 'ribbon', wanted one of tile, sample"),
-        ("precompute blaze.toml --largest-angle 91", "largest_angle: got 91"),
-        ("precompute blaze.toml --largest-angle steep", "--largest-angle"),
-        ("precompute deep.toml --representation taylor", "of a range of 4.92 µm"),
-        ("precompute blaze.toml --terms 20", "terms: got 20 with representation 'auto', wanted it with a series"),
-        ("precompute blaze.toml --representation taylor --terms 20.5", "--terms"),
-        ("precompute scan.npy --pixel-size 0.05 --extent sample", "wanted at least 4 pixels (0.2 µm)"),
-        ("precompute blaze.toml --pixel-size 0.1", "--pixel-size"),
-        ("precompute blaze.toml --fill-missing", "--fill-missing go with a scan; the recipe blaze.toml"),
-        ("precompute holed.npy --pixel-size 0.05", "1 of 48 pixels are missing"),
-        ("precompute holed.npy --pixel-size 0.05", "--fill-missing, fills them from their surroundings"),
+        ("precompute blaze.toml,tolerance=fine", "tolerance: got 'fine'"),
+        ("precompute blaze.toml,tolerance=7", "tolerance: got 7"),
+        ("precompute blaze.toml,tolerance=nan", "tolerance: got nan"),
+        ("precompute blaze.toml,coherence_length=-3", "coherence_length: got -3"),
+        ("precompute blaze.toml,representation=wavelets", "representation: got 'wavelets'"),
+        ("precompute blaze.toml,extent=ribbon", "extent: got 'ribbon', wanted one of tile, sample"),
+        ("precompute blaze.toml,largest_angle=91", "largest_angle: got 91"),
+        ("precompute blaze.toml,largest_angle=steep", "largest_angle: got 'steep'"),
+        ("precompute deep.toml,representation=taylor", "of a range of 4.92 µm"),
+        ("precompute blaze.toml,terms=20", "terms: got 20 with representation 'auto', wanted it with a series"),
+        ("precompute blaze.toml,representation=taylor,terms=20.5", "terms: got 20.5, wanted a whole number"),
+        ("precompute scan.npy,pixel_size=0.05,extent=sample", "wanted at least 4 pixels (0.2 µm)"),
+        ("precompute blaze.toml,pixel_size=0.1", "blaze.toml: got pixel_size, wanted some of period, depth, "),
+        ("precompute blaze.toml,tolerence=0.1", "; did you mean tolerance?"),
+        ("precompute blaze.toml,depth", "blaze.toml,depth: got 'depth', wanted name=value"),
+        ("precompute blaze.toml --tolerance", "--tolerance: got no value"),
+        ("precompute blaze.toml --pixel-sise 1", "No such option: --pixel-sise"),
+        ("precompute holed.npy,pixel_size=0.05", "1 of 48 pixels are missing"),
+        ("precompute holed.npy,pixel_size=0.05", "fill_missing=True fills them from their surroundings"),
         ("precompute blaze.toml -o out.png", "out.png"),
         ("precompute blaze.toml -o out", "ends in .exr"),
         ("precompute blaze.toml -o nowhere/out.exr", "nowhere/out.exr"),
@@ -89,17 +92,17 @@ def files():
         ("precompute scan.npy", "pixel_size"),
         ("precompute counts.npy", "pixel_size, height_range: both missing"),
         ("render scene.xml -D a=1 -D a=2", "-D a: got it twice"),
-        ("precompute scan.npy --pixel-size 0", "pixel_size: got 0"),
-        ("precompute scan.npy --pixel-size 1e6", "got 1e+06 µm, wanted at most the coherence length, 65 µm"),
+        ("precompute scan.npy,pixel_size=0", "pixel_size: got 0"),
+        ("precompute scan.npy,pixel_size=1e6", "got 1e+06 µm, wanted at most the coherence length, 65 µm"),
         (
-            "precompute scan.npy --pixel-size 30 --coherence-length 20",
-            "--pixel-size: got 30 µm, wanted at most the coherence length, 20 µm",
+            "precompute scan.npy,pixel_size=30,coherence_length=20",
+            "pixel_size: got 30 µm, wanted at most the coherence length, 20 µm",
         ),
-        ("precompute scan.npy --pixel-size 0.05 --height-range 1", "height_range"),
-        ("inspect pixel.npy --pixel-size 0.05", "pixel.npy: got a surface of 1 × 1 pixel, wanted more"),
+        ("precompute scan.npy,pixel_size=0.05,height_range=1", "height_range"),
+        ("inspect pixel.npy,pixel_size=0.05", "pixel.npy: got a surface of 1 × 1 pixel, wanted more"),
         ("efficiency scan.npy", "scan.npy: pixel_size: the file has none, wanted one number or (x, y) in µm"),
         ("efficiency gone.exr", "gone.exr"),
-        ("precompute counts.npy --pixel-size 0.05", "height_range: missing"),
+        ("precompute counts.npy,pixel_size=0.05", "height_range: missing"),
         ("render", "Missing argument"),
         ("render gone.xml", "gone.xml"),
         ("render scene.xml -o out.tiff", "out.tiff, wanted a file name that ends in .exr, .png or .jpg"),
@@ -165,11 +168,11 @@ def test_a_spectrum_cut_short_is_one_line(command):
 
 def test_precompute_writes_the_file_that_it_names_and_prints_its_error(command):
     Path("blaze.toml").write_text(BLAZE.replace("0.2", "0.25"))
-    code, out, err = command("precompute blaze.toml --coherence-length 65")
+    code, out, err = command("precompute blaze.toml,coherence_length=65")
     assert (code, err.strip()) == (0, "")
     line = r"blaze.exr: period 2.5 µm, 0.\d+ µm deep; error \d\.\de-\d\d \(tolerance 0.001\); \d\.\d kB\n"
     assert re.fullmatch(line, out)
-    code, out, _ = command("precompute blaze.toml --coherence-length 65 --verbose")
+    code, out, _ = command("precompute blaze.toml,coherence_length=65 --verbose")
     spectrum = md.GratingSpectrum.load("blaze.exr")
     assert out.startswith("blaze.exr: ")
     assert len(out.splitlines()) == 4
@@ -191,8 +194,8 @@ def test_precompute_writes_the_file_that_it_names_and_prints_its_error(command):
 @pytest.mark.slow
 def test_precompute_takes_a_sample_by_options(command):
     code, out, err = command(
-        "precompute wide.npy --pixel-size 0.09 --extent sample --largest-angle 60 --tolerance 0.02 -o out.exr "
-        "--representation slices --verbose"
+        "precompute wide.npy,pixel_size=0.09,extent=sample,largest_angle=60,tolerance=0.02,"
+        "representation=slices -o out.exr --verbose"
     )
     assert code == 0
     messages = err.splitlines()
@@ -211,7 +214,7 @@ def test_precompute_takes_a_sample_by_options(command):
 
 
 def test_a_smaller_angle_takes_fewer_orders(command):
-    code, out, _ = command("precompute blaze.toml --largest-angle 29 --verbose")
+    code, out, _ = command("precompute blaze.toml,largest_angle=29 --verbose")
     assert code == 0
     assert "13 × 1 orders" in out
     assert md.GratingSpectrum.load("blaze.exr").largest_angle == 29.0
@@ -219,14 +222,14 @@ def test_a_smaller_angle_takes_fewer_orders(command):
 
 def test_options_override_the_recipe(command):
     Path("blaze.toml").write_text(BLAZE + "[spectrum]\ntolerance = 0.1\ncoherence_length = 30\n")
-    code, _, _ = command("precompute blaze.toml -o out.exr --tolerance 0.02 --coherence-length 20")
+    code, _, _ = command("precompute blaze.toml,tolerance=0.02,coherence_length=20 -o out.exr")
     assert code == 0
     spectrum = md.GratingSpectrum.load("out.exr")
     assert (spectrum.tolerance, spectrum.coherence_length) == (0.02, 20.0)
 
 
 def test_precompute_takes_a_series_by_options(command):
-    code, out, _ = command("precompute blaze.toml -o out.exr --representation taylor --terms 6 --heights-from lowest")
+    code, out, _ = command("precompute blaze.toml,representation=taylor,terms=6,heights_from=lowest -o out.exr")
     assert code == 0
     assert "! taylor: 6 terms of heights from the lowest" in out
     settings = md.GratingSpectrum.load("out.exr").settings
@@ -235,7 +238,7 @@ def test_precompute_takes_a_series_by_options(command):
 
 
 def test_scans_are_read_with_their_scale(command):
-    code, _, _ = command("precompute counts.npy --extent tile --pixel-size 0.05 --height-range 0.5 -o out.exr")
+    code, _, _ = command("precompute counts.npy,extent=tile,pixel_size=0.05,height_range=0.5 -o out.exr")
     assert code == 0
     spectrum = md.GratingSpectrum.load("out.exr")
     assert spectrum.height_range == pytest.approx(47 / 255 * 0.5)
@@ -244,7 +247,7 @@ def test_scans_are_read_with_their_scale(command):
 
 
 def test_missing_pixels_of_a_scan_are_filled_on_request(command):
-    code, out, _ = command("precompute holed.npy --extent tile --pixel-size 0.05 --fill-missing -o out.exr --verbose")
+    code, out, _ = command("precompute holed.npy,extent=tile,pixel_size=0.05,fill_missing=true -o out.exr --verbose")
     assert code == 0
     assert "\nholed.npy (1 missing pixel filled)\n" in out
     spectrum = md.GratingSpectrum.load("out.exr")
@@ -258,15 +261,15 @@ def test_a_bare_scan_with_a_seam_wants_an_extent(command):
     np.save("whole.npy", 0.1 * np.sin(2 * np.pi * x / 0.8) + np.zeros((8, 1)))
     np.save("broken.npy", 0.1 * np.sin(2 * np.pi * x / 0.9) + np.zeros((8, 1)))
     before = files()
-    code, out, err = command("precompute broken.npy --pixel-size 0.05 --tolerance 0.01")
+    code, out, err = command("precompute broken.npy,pixel_size=0.05,tolerance=0.01")
     assert (code, out, files()) == (2, "", before)
     assert len(err.splitlines()) == 1
     assert re.search(r"r.m.s. steps of 64.3 nm along x \(\d\d.\d inside\) and 0 nm along y", err)
-    for words in ("--extent sample", "--extent tile", "crop_periods"):
+    for words in ("extent=sample", "extent=tile", "crop_periods"):
         assert words in err
-    code, out, _ = command("precompute broken.npy --pixel-size 0.05 --tolerance 0.01 --extent tile")
+    code, out, _ = command("precompute broken.npy,pixel_size=0.05,tolerance=0.01,extent=tile")
     assert (code, "seam" in out) == (0, False)
-    code, out, _ = command("precompute whole.npy --pixel-size 0.05 --tolerance 0.01")
+    code, out, _ = command("precompute whole.npy,pixel_size=0.05,tolerance=0.01")
     assert code == 0
     assert "repeated as a tile; r.m.s. steps at the seam" in out
 
@@ -278,7 +281,7 @@ def test_the_version_is_printed(command):
 
 
 def test_help_shows_the_defaults(command):
-    for words in (("precompute", "default: auto"), ("precompute", "default: 0.01"), ("render", "or 64")):
+    for words in (("precompute", "default: ./NAME.exr"), ("render", "or 64")):
         code, out, _ = command(words[0], "--help")
         assert code == 0
         assert words[1] in " ".join(re.sub(r"[│|]", " ", out).split())
@@ -321,7 +324,7 @@ def test_a_folder_whose_name_looks_like_markup_is_accepted(command):
 
 
 def test_a_warning_is_a_line_and_not_a_failure(command):
-    code, out, err = command("precompute scan.npy --extent tile --pixel-size 0.2 -o out.exr")
+    code, out, err = command("precompute scan.npy,extent=tile,pixel_size=0.2 -o out.exr")
     assert code == 0
     assert "out.exr" in out
     messages = [line for line in err.splitlines() if line]
@@ -421,7 +424,7 @@ def test_an_error_in_a_loop_of_drjit_shows_its_cause(command, monkeypatch, llvm,
 
 
 def test_debug_shows_where_a_request_is_refused(command):
-    code, _, err = command("--debug precompute blaze.toml --tolerance 7")
+    code, _, err = command("--debug precompute blaze.toml,tolerance=7")
     assert code == 2
     assert err.startswith("Traceback")
     assert err.splitlines()[-1].startswith("mitsuba-diffraction: error: tolerance: got 7")

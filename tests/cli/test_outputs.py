@@ -115,7 +115,7 @@ def test_a_scene_names_files(folder):
         ("inspect scan.toml --json scan.toml", "scan.toml"),
         ("validate scan.toml --json scan.toml", "scan.toml"),
         ("validate scan.toml --markdown scan.png", "scan.png"),
-        ("benchmark scan.png --pixel-size 0.05 --height-range 0.3 --plot scan.png", "scan.png"),
+        ("benchmark scan.png,pixel_size=0.05,height_range=0.3 --plot scan.png", "scan.png"),
     ],
 )
 def test_inputs_are_not_overwritten(command, line, name):
@@ -168,14 +168,15 @@ def test_two_outputs_of_one_name_are_refused(command, line, name):
     ("line", "other", "name"),
     [
         (f"{RENDER} -o a.exr", "--seed 1", "a.exr"),
-        ("precompute blaze.toml -o a.exr", "--tolerance 0.05", "a.exr"),
-        ("inspect blaze.toml -o a.png --json a.json", "--coherence-length 5", "a.png"),
+        ("precompute blaze.toml -o a.exr", ",tolerance=0.05", "a.exr"),
+        ("inspect blaze.toml -o a.png --json a.json", ",coherence_length=5", "a.png"),
     ],
 )
 def test_own_files_are_overwritten_and_foreign_files_only_with_the_option(command, line, other, name):
     assert command(line)[0] == 0
     before = Path(name).read_bytes()
-    assert command(f"{line} {other}")[0] == 0
+    changed = line.replace(".toml", f".toml{other}") if other.startswith(",") else f"{line} {other}"
+    assert command(changed)[0] == 0
     assert Path(name).read_bytes() != before
     Path(name).write_text("a year's work")
     assert "--overwrite" in refused(command, line, name)
@@ -352,7 +353,7 @@ def test_a_seal_covers_every_byte():
 
 
 @pytest.mark.posix("named pipes and devices")
-@pytest.mark.parametrize("line", ["precompute NAME.npy --pixel-size 1", "inspect NAME.npy", "precompute NAME.toml"])
+@pytest.mark.parametrize("line", ["precompute NAME.npy,pixel_size=1", "inspect NAME.npy", "precompute NAME.toml"])
 @pytest.mark.parametrize("kind", ["pipe", "device"])
 def test_pipes_and_devices_are_refused(command, line, kind):
     # Regression: the command waited for ever, or filled the memory.

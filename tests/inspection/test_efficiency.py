@@ -237,7 +237,7 @@ def test_the_command_writes_numbers_and_plot(command, tmp_path, monkeypatch):
     [
         ("efficiency blazd", "blazd: no file and no surface has this name; did you mean blazed?"),
         ("efficiency blazed,depth", "blazed,depth: got 'depth', wanted name=value"),
-        ("efficiency blazed,peroid=2", "largest_height_range, representation, terms, heights_from, tolerance; did you"),
+        ("efficiency blazed,peroid=2", "; did you mean period?"),
         ("efficiency blazed,depth=1,depth=2", "got 'depth=2', wanted name=value, each name once"),
         ("efficiency blazed --angle 0:60", "--angle: got '0:60', wanted a number"),
         ("efficiency blazed --angle 0:60:-5", "--angle: got '0:60:-5', wanted a number"),
@@ -257,12 +257,12 @@ def test_the_command_takes_theory_and_material_of_a_recipe(command):
     code, said, error = command("efficiency", str(recipe), "--wavelength", "600")
     assert (code, error) == (0, "")
     assert "Al, rigorous theory" in said
-    code, said, error = command("efficiency", f"{recipe},depth=0", "--wavelength", "600", "--int-ior", "1.5")
+    code, said, error = command("efficiency", f"{recipe},depth=0,int_ior=1.5", "--wavelength", "600")
     assert (code, error) == (0, "")
     head, row = (line.split() for line in said.splitlines()[-2:])
     transmitting = recipe.with_name("transmission_600.toml")
     _, of_recipe, _ = command("efficiency", str(transmitting), "--wavelength", "600")
     assert "rigorous theory, transmitted by a sheet" in of_recipe
-    _, inside, _ = command("efficiency", str(transmitting), "--wavelength", "600", "--transmission", "interface")
+    _, inside, _ = command("efficiency", f"{transmitting},transmission=interface", "--wavelength", "600")
     assert "rigorous theory, transmitted orders inside" in inside
     assert row[head.index("0") + 1] == row[-1] == "4.000"  # the unit of the wavelength is a word, too

@@ -410,7 +410,7 @@ def folder(tmp_path, monkeypatch):
 
 @pytest.mark.slow
 def test_inspect_prints_numbers_and_draws_a_slide(folder, command):
-    code, out, err = command("inspect waves.npy --pixel-size 0.08 --json numbers.json")
+    code, out, err = command("inspect waves.npy,pixel_size=0.08 --json numbers.json")
     assert (code, err) == (0, "")
     for words in (
         "8 × 8 µm, 100 × 100 pixels",
@@ -433,7 +433,7 @@ def test_inspect_prints_numbers_and_draws_a_slide(folder, command):
 
 def test_a_file_name_is_shown_as_it_is(folder, command):
     np.save("[red]:smile:.npy", np.random.default_rng(0).standard_normal((40, 40)) * 0.01)
-    code, out, err = command("inspect [red]:smile:.npy --pixel-size 0.08 -o picture.png")
+    code, out, err = command("inspect [red]:smile:.npy,pixel_size=0.08 -o picture.png")
     assert (code, err) == (0, "")
     assert "surface           [red]:smile:.npy" in out
 
@@ -441,10 +441,10 @@ def test_a_file_name_is_shown_as_it_is(folder, command):
 @pytest.mark.slow
 def test_a_profile_of_one_period_is_inspected(folder, command):
     np.save("ridges.npy", 0.1 * np.abs(np.sin(np.pi * np.arange(256) / 256))[None])
-    code, out, err = command("inspect ridges.npy --pixel-size 0.005078125")
+    code, out, err = command("inspect ridges.npy,pixel_size=0.005078125")
     assert (code, err) == (0, "")
-    assert "none stands out (for a single period of a grating: --extent tile)" in out
-    code, out, err = command("inspect ridges.npy --pixel-size 0.005078125 --extent tile --overwrite")
+    assert "none stands out (for a single period of a grating: extent=tile)" in out
+    code, out, err = command("inspect ridges.npy,pixel_size=0.005078125,extent=tile --overwrite")
     assert (code, err) == (0, "")
     assert "period            1.3 µm along 0°" in out
     tips = re.findall(r"tip broadening.*?\)\s+(\S+)", out)
@@ -459,10 +459,10 @@ def test_a_profile_of_one_period_is_inspected(folder, command):
 def test_inspect_takes_the_options_of_precompute(folder, command):
     heights = np.load("waves.npy")
     np.save("waves.npy", heights + 0.01 * np.arange(100))
-    code, out, _ = command("inspect waves.npy --pixel-size 0.08")
+    code, out, _ = command("inspect waves.npy,pixel_size=0.08")
     assert "Level it" in out
     code, out, err = command(
-        "inspect waves.npy --pixel-size 0.08 --plane --coherence-length 3 --extent sample --overwrite"
+        "inspect waves.npy,prepare=level_plane,pixel_size=0.08,coherence_length=3,extent=sample --overwrite"
     )
     assert (code, err) == (0, "")
     assert "Level it" not in out
@@ -520,14 +520,14 @@ def test_inspect_takes_a_recipe(folder, command):
     ("arguments", "words"),
     [
         ("inspect", "Missing argument"),
-        ("inspect gone.npy --pixel-size 0.1", "gone.npy"),
+        ("inspect gone.npy,pixel_size=0.1", "gone.npy"),
         ("inspect gone.toml", "gone.toml"),
         ("inspect waves.npy", "pixel_size"),
-        ("inspect waves.npy --pixel-size 0.08 -o picture.exr", "-o: got picture.exr"),
-        ("inspect waves.npy --pixel-size 0.08 -o nowhere/picture.png", "nowhere"),
-        ("inspect waves.npy --pixel-size 0.08 --json nowhere/n.json", "--json: got nowhere/n.json"),
-        ("inspect foil.toml --pixel-size 0.1", "go with a scan"),
-        ("inspect grey.png --pixel-size 0.1 -o ./grey.png", "which is read"),
+        ("inspect waves.npy,pixel_size=0.08 -o picture.exr", "-o: got picture.exr"),
+        ("inspect waves.npy,pixel_size=0.08 -o nowhere/picture.png", "nowhere"),
+        ("inspect waves.npy,pixel_size=0.08 --json nowhere/n.json", "--json: got nowhere/n.json"),
+        ("inspect foil.toml,unit=nm", "foil.toml: got unit, wanted some of "),
+        ("inspect grey.png,pixel_size=0.1 -o ./grey.png", "which is read"),
         ("inspect foil.toml --angle 30", "--angle: got 30 without --view"),
         ("inspect foil.toml --view 30:", "--view: got '30:', wanted a number"),
         ("inspect foil.toml --view 10,95", "--view: got 95, wanted degrees above −90 and below 90"),

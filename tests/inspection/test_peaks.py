@@ -99,7 +99,7 @@ def scan(tmp_path, monkeypatch):
 
 @pytest.mark.slow
 def test_the_command_answers_for_scan_recipe_and_spectrum(command, scan, sinusoid):
-    code, of_scan, _ = command("efficiency scan.npy --pixel-size 0.08 --csv e.csv")
+    code, of_scan, _ = command("efficiency scan.npy,pixel_size=0.08 --csv e.csv")
     assert code == 0
     assert re.search(r"peak a: period (0\.9\d|1\.0\d) ± 0\.\d+ µm along", of_scan)
     assert of_scan == command("efficiency scan.toml")[1] + "e.csv: all numbers\n"
@@ -113,14 +113,14 @@ def test_the_command_answers_for_scan_recipe_and_spectrum(command, scan, sinusoi
 @pytest.mark.parametrize(
     ("line", "message"),
     [
-        ("saved.exr --pixel-size 1", "saved.exr: got pixel_size with a saved spectrum, wanted the recipe or the scan"),
-        ("scan.toml --theory rigorous", "scan.toml: got theory rigorous, transmission none of an irregular surface"),
-        ("scan.npy --pixel-size 1 --wavelength 300", "wavelengths: got 300, wanted nm from 360 to 830"),
-        ("scan.npy --pixel-size 1 --material Alu", "material: got 'Alu'"),
-        ("scan.npy --pixel-size 1 --angle 90", "--angle: got 90, wanted degrees above −90 and below 90"),
-        ("scan.npy,depth=1 --pixel-size 1", "scan.npy: got depth, wanted the options of a scan"),
-        ("blazed --pixel-size 1", "blazed: got pixel_size, wanted some of period, depth, "),
-        ("blazed,dept=1", "blazed: got dept, wanted some of period, depth, "),
+        ("saved.exr,pixel_size=1", "saved.exr: got pixel_size with a saved spectrum, wanted the recipe or the scan"),
+        ("scan.toml,theory=rigorous", "scan.toml: got theory rigorous, transmission none of an irregular surface"),
+        ("scan.npy,pixel_size=1 --wavelength 300", "wavelengths: got 300, wanted nm from 360 to 830"),
+        ("scan.npy,pixel_size=1,material=Alu", "material: got 'Alu'"),
+        ("scan.npy,pixel_size=1 --angle 90", "--angle: got 90, wanted degrees above −90 and below 90"),
+        ("scan.npy,depth=1,pixel_size=1", "scan.npy: got depth, wanted some of pixel_size, "),
+        ("blazed,pixel_size=1", "blazed: got pixel_size, wanted some of period, depth, "),
+        ("blazed,dept=1", "transmission; did you mean depth?"),
     ],
 )
 def test_wrong_commands_are_refused(command, scan, line, message):

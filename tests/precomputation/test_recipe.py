@@ -554,11 +554,11 @@ def test_a_recipe_takes_unit_and_channel(tmp_path):
 
 
 @pytest.mark.slow
-def test_the_command_takes_the_same_options_of_a_scan(tmp_path, command, monkeypatch):
+def test_the_command_takes_the_same_values_of_a_scan(tmp_path, command, monkeypatch):
     monkeypatch.chdir(tmp_path)
     tilted(tmp_path)
-    steps = "--prepare level_plane --prepare fill_missing --prepare trim_edges=0.1 --prepare crop_periods=x"
-    code, out, err = command(f"precompute scan.npy --pixel-size 0.05 --tolerance 0.01 --extent tile {steps}")
+    steps = "prepare=level_plane,prepare=fill_missing,prepare=trim_edges=0.1,prepare=crop_periods=x"
+    code, out, err = command(f"precompute scan.npy,pixel_size=0.05,tolerance=0.01,extent=tile,{steps}")
     assert code == 0, err
     source = GratingSpectrum.load("scan.exr").source
     assert out.startswith("scan.exr: tile of ")
@@ -569,17 +569,14 @@ def test_the_command_takes_the_same_options_of_a_scan(tmp_path, command, monkeyp
         "crop_periods",
     ]
     (tmp_path / "scan.xyz").write_text("0 0 1\n1 0 2\n0 1 3\n1 1 4\n")
-    code, out, err = command("precompute scan.xyz --unit um --unit nm --extent tile -o points.exr --tolerance 0.01")
+    code, out, err = command("precompute scan.xyz,unit=um,unit=nm,extent=tile,tolerance=0.01 -o points.exr")
     assert code == 0, err
     assert GratingSpectrum.load("points.exr").height_range == pytest.approx(3e-3)
     for arguments, words in (
-        ("scan.npy --channel Height", "channel: got 'Height' for .npy"),
-        ("scan.xyz --unit V", "unit: got the unit 'V'"),
-        ("scan.npy --prepare rotate=left", "prepare: rotate: got 'left', wanted a number"),
-        (
-            "recipe.toml --unit nm --prepare despike",
-            "--unit, --prepare go with a scan; the recipe recipe.toml has its own",
-        ),
+        ("scan.npy,channel=Height", "channel: got 'Height' for .npy"),
+        ("scan.xyz,unit=V", "unit: got the unit 'V'"),
+        ("scan.npy,prepare=rotate=left", "prepare: rotate: got 'left', wanted a number"),
+        ("blazed,unit=nm,prepare=despike", "blazed: got unit, prepare, wanted some of "),
     ):
         code, out, err = command(f"precompute {arguments} --overwrite")
         assert (code, out, len(err.splitlines())) == (2, "", 1)
@@ -657,7 +654,7 @@ tolerance = 0.05
 @pytest.mark.parametrize(
     ("line", "reads"),
     [
-        pytest.param("precompute scan.npy --pixel-size 0.05 --tolerance 0.05", 1, marks=pytest.mark.slow),
+        pytest.param("precompute scan.npy,pixel_size=0.05,tolerance=0.05", 1, marks=pytest.mark.slow),
         pytest.param("precompute scan.toml", 1, marks=pytest.mark.slow),
         ("inspect scan.toml", 1),
         ("render scene.xml --spp 1 --width 4 --overwrite", 1),

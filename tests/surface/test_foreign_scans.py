@@ -266,7 +266,7 @@ def test_the_second_unit_overrides_that_of_the_heights_in_a_file(name, write, tm
     (tmp_path / name).write_bytes(write())
     plain = read_height_field(tmp_path / name)
     for unit in ("cm", ("cm", "m")):
-        with pytest.warns(UserWarning, match=r"unit \(--unit um") if unit == ("cm", "m") else nullcontext():
+        with pytest.warns(UserWarning, match=r"unit \(unit=um") if unit == ("cm", "m") else nullcontext():
             field = read_height_field(tmp_path / name, unit=unit)
         assert field.pixel_size == plain.pixel_size
     ratio = field.height_range / plain.height_range

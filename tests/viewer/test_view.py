@@ -64,7 +64,7 @@ def test_all_kinds_of_surfaces_are_shown(command, tmp_path, monkeypatch):
     shutil.copytree(RECIPES / "measured", "measured", ignore=shutil.ignore_patterns("*65um*"))
     Path("recipe.toml").write_text('[surface]\nprofile = "blazed"\nperiod = 1.0\ndepth = 0.02\nsamples = 32\n')
     md.precompute(md.gratings.blazed(1.0, 0.02, samples=32), coherence_length=2).save("saved.exr")
-    scan = "measured/elaphe_afm_100x100.png --pixel-size 0.0586 --height-range 0.375 --coherence-length 1"
+    scan = "measured/elaphe_afm_100x100.png,pixel_size=0.0586,height_range=0.375,coherence_length=1"
     for source, name in ((scan, "elaphe_afm_100x100"), ("recipe.toml", "recipe"), ("saved.exr", "saved")):
         code, out, _ = command(f"view {source} --no-open")
         assert code == 0
@@ -151,9 +151,9 @@ def test_a_large_page_is_refused(monkeypatch):
 def test_the_coherence_length_that_a_refusal_names_is_short_enough(monkeypatch):
     scan = dict(parameters={"size": 16.0}, extent="sample", tolerance=0.05)
     monkeypatch.setattr(pages, "MAX_PAGE_BYTES", 650_000)
-    with pytest.raises(ValueError, match=r"table smaller: --coherence-length \d") as refused:
+    with pytest.raises(ValueError, match=r"table smaller: coherence_length=\d") as refused:
         md.view(md.Recipe.of_profile("elaphe_synthetic", coherence_length=8.0, **scan))
-    length = float(str(refused.value).rpartition(" ")[2])
+    length = float(str(refused.value).rpartition("=")[2])
     md.view(md.Recipe.of_profile("elaphe_synthetic", coherence_length=length, **scan))
 
 
@@ -224,7 +224,7 @@ def test_a_disc_opens_under_plastic_with_its_tracks_round_the_centre(source, com
 def test_several_surfaces_are_a_list_in_one_page(command, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     np.save("scan.npy", 0.05 * np.random.default_rng(1).random((32, 32)))
-    scan = "scan.npy --pixel-size 0.1 --coherence-length 1.5 --unit um"
+    scan = "scan.npy,pixel_size=0.1,coherence_length=1.5,unit=um"
     other = SMALL.replace("blazed", "lamellar,period=1")
     code, out, error = command(f"view {SMALL},material=Al {other} {scan} --no-open")
     assert code == 0, error

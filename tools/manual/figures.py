@@ -81,7 +81,7 @@ FIGURES = (
     Figure(("eye_chart.png",), "python tools/manual/eye_chart.py {out}/eye_chart.png"),
     Figure(
         ("efficiencies.png",),
-        """mitsuba-diffraction efficiency ruled,lines_per_mm=1200 --theory rigorous --material Al --angle 17.5 \
+        """mitsuba-diffraction efficiency ruled,lines_per_mm=1200,theory=rigorous,material=Al --angle 17.5 \
             --wavelength 400:700:10 --plot {out}/efficiencies.png""",
     ),
     Figure(("first_scene.png",), "python tools/manual/first_scene.py {out}/first_scene.png"),

@@ -4,32 +4,24 @@ from __future__ import annotations
 
 from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import Annotated, Any
 
 import typer
 
-from ...cli.arguments import (
-    Overwrite,
-    Variant,
-    options_of_scan,
-    recipe_of,
-    settings_of,
-    takes_scan,
-)
+from ...cli.arguments import KEYS_OF_RECIPES, SURFACE, Overwrite, Variant
 from ...errors import RequestError
 from ...files import outputs
-from ...precomputation.recipe import source_named
+from ...precomputation.recipe import Recipe
+from ...precomputation.surface_text import parsed
 from ...progress import progress_bar, show, tell
 
-if TYPE_CHECKING:
-    from ...precomputation.recipe import Recipe
 
-
-@takes_scan
 def validate(
-    context: typer.Context,
     surface: Annotated[
-        Path | None, typer.Argument(metavar="[SURFACE]", help="check only this recipe (.toml), profile or scan")
+        str | None,
+        typer.Argument(
+            metavar=f"[{SURFACE}]", help=f"check only this recipe (.toml), profile or scan; {KEYS_OF_RECIPES}"
+        ),
     ] = None,
     variant: Variant = None,
     json: Annotated[Path | None, typer.Option(help="save the results (.json)")] = None,
@@ -44,15 +36,10 @@ def validate(
     from .. import report
     from ..validation.checks import checks, surface_checks
 
-    of_scan, settings = options_of_scan(context), settings_of(context)
-    if surface is None and (of_scan or settings):
-        names = ", ".join(f"--{name.replace('_', '-')}" for name in {**of_scan, **settings})
-        raise RequestError(
-            f"{names}: got no surface; they go with a scan, --extent and --coherence-length with a recipe, too"
-        )
     chosen = choose_variant(variant)
-    recipe = None if surface is None else _recipe(surface, of_scan, settings)
-    reads = [] if surface is None or recipe is None else [surface, *recipe.files]
+    source, values = ("", {}) if surface is None else parsed(surface)
+    recipe = _recipe(source, values) if source else None
+    reads = [] if recipe is None else [Path(source), *recipe.files]
     writes = [(option, path) for option, path in (("--json", json), ("--markdown", markdown)) if path is not None]
     outputs.check_outputs(reads, writes, overwrite=overwrite)
     mi.set_variant(chosen)
@@ -82,10 +69,10 @@ def validate(
         raise RuntimeError(f"{len(missed)} of {promised} checks missed: {'; '.join(missed)}")
 
 
-def _recipe(path: Path, of_scan: dict[str, object], settings: dict[str, object]) -> Recipe:
-    recipe = recipe_of(Path(source_named(str(path))), of_scan, settings)
+def _recipe(source: str, values: dict[str, Any]) -> Recipe:
+    recipe = Recipe.of_source(source, values)
     if recipe.patches > 1:
         recipe = replace(recipe, surface={**recipe.surface, "patches": 1})
     if recipe.settings.theory == "rigorous":
-        raise RequestError(f"{path}: got theory = 'rigorous', wanted scalar; precompute prints the measured errors")
+        raise RequestError(f"{source}: got theory = 'rigorous', wanted scalar; precompute prints the measured errors")
     return recipe

@@ -7,17 +7,18 @@ from typing import Annotated
 
 import typer
 
-from ...cli.arguments import HeightRange, Overwrite, PixelSize, Variant, check_suffix
+from ...cli.arguments import KEYS_OF_RECIPES, SURFACE, Overwrite, Variant, check_suffix
 from ...errors import RequestError
 from ...files import outputs
+from ...precomputation.recipe import Recipe
+from ...precomputation.surface_text import parsed
 from ...progress import progress_bar, show, table
-from ...surface.readers import read_height_field
 
 
 def benchmark(
-    scan: Annotated[Path | None, typer.Argument(metavar="[SCAN]", help="also measure this scan")] = None,
-    pixel_size: PixelSize = None,
-    height_range: HeightRange = None,
+    scan: Annotated[
+        str | None, typer.Argument(metavar=f"[{SURFACE}]", help=f"also measure this scan; {KEYS_OF_RECIPES}")
+    ] = None,
     surface: Annotated[list[str] | None, typer.Option(help="only these of the built-in surfaces")] = None,
     tolerance: Annotated[list[float] | None, typer.Option(help="only these tolerances")] = None,
     variant: Variant = None,
@@ -45,7 +46,8 @@ def benchmark(
     if plot is not None:
         check_suffix("--plot", plot, ".png")
     writes = [(option, path) for option, path in (("--json", json), ("--plot", plot)) if path is not None]
-    outputs.check_outputs([] if scan is None else [scan], writes, overwrite=overwrite)
+    source, values = ("", {}) if scan is None else parsed(scan)
+    outputs.check_outputs([Path(source)] if source else [], writes, overwrite=overwrite)
     if terms and (scan is not None or surface or tolerance):
         raise RequestError("--terms: got other surfaces or tolerances, too; it has tiles of its own")
     if pictures and (scan is not None or surface or tolerance or terms or plot is not None):
@@ -56,7 +58,10 @@ def benchmark(
         raise RequestError(f"--surface: got {', '.join(sorted(unknown))}, wanted among {', '.join(names)}")
     cases = [case for case in cases if not surface or case.name in surface]
     if scan is not None:
-        cases.append(scan_case(read_height_field(scan, pixel_size=pixel_size, height_range=height_range)))
+        recipe = Recipe.of_source(source, values)
+        if "scan" not in recipe.surface:
+            raise RequestError(f"{source}: got no scan; --surface takes the built-in surfaces")
+        cases.append(scan_case(recipe.height_field()))
     mi.set_variant(choose_variant(variant))
     if terms:
         _measure_terms(json, plot)

@@ -74,8 +74,8 @@ _HEADER_BYTES = 4096  # of a text
 # What a scan that diffracts light can be, µm; outside, a unit is wrong.
 _MIN_HEIGHT_RANGE, _MAX_HEIGHT_RANGE = 2e-4, Settings.largest_height_range
 _MIN_PIXEL, _MAX_PIXEL, _MAX_FIELD = 1e-4, 100.0, 5e4
-_UNITS = "unit (--unit um --unit m: lateral lengths in µm, heights in m)"
-_RANGE = "height_range (--height-range), in µm,"
+_UNITS = "unit (unit=um,unit=m: lateral lengths in µm, heights in m)"
+_RANGE = "height_range, in µm,"
 
 
 def read_height_field(
@@ -134,6 +134,7 @@ def read_height_field(
     """
     path = Path(path)
     refuse_special(path)
+    hint = f"; on the command line: {path.name},pixel_size=…"
     try:
         # Numbers that overflow become infinite, and are refused as missing pixels or invalid lengths.
         with np.errstate(over="ignore", invalid="ignore"):
@@ -143,19 +144,19 @@ def read_height_field(
             if pixel_size is None and scan.pixel_size is None and height_range is None and integers:
                 raise RequestError(
                     f"pixel_size, height_range: both missing for {scan.numbers.dtype} heights, wanted one number or "
-                    "(x, y) in µm, and the height in µm from black to white (--pixel-size, --height-range)"
+                    f"(x, y) in µm, and the height in µm from black to white{hint},height_range=…"
                 )
             heights = _as_micrometres(scan.numbers, height_range)
         if not (fill_missing or keep_missing) and scan.numbers.dtype.kind in "iu" and np.ma.is_masked(scan.numbers):
             fraction = np.ma.getmaskarray(scan.numbers).mean()
             raise RequestError(
                 f"{fraction:.2%} of the pixels are coloured, annotation on a grey picture; they can be "
-                "treated as missing and filled from their surroundings (fill_missing=True, or --fill-missing)"
+                "treated as missing and filled from their surroundings (fill_missing=True)"
             )
         doubt = scan.doubt if pixel_size is None else ""
         pixel_size = scan.pixel_size if pixel_size is None else pixel_size
         if pixel_size is None:
-            raise RequestError("pixel_size: the file has none, wanted one number or (x, y) in µm")
+            raise RequestError(f"pixel_size: the file has none, wanted one number or (x, y) in µm{hint}")
         source = f"{path.name}, {scan.channel}" if scan.channel else path.name
         field = HeightField(heights, pixel_size, source, fill_missing=fill_missing, keep_missing=keep_missing)
         _check_scale(field, not keep_missing, _RANGE if integers else _UNITS)
@@ -163,7 +164,7 @@ def read_height_field(
     except (RequestError, OSError, MemoryError) as error:
         raise RequestError(f"{path}: {textwrap.shorten(str(error), _MAX_QUOTE, placeholder=' …')}") from error
     if doubt:
-        warnings.warn(f"{source}: {doubt}; pixel_size (--pixel-size), in µm, sets another scale", stacklevel=2)
+        warnings.warn(f"{source}: {doubt}; pixel_size, in µm, sets another scale", stacklevel=2)
     return field
 
 
@@ -173,7 +174,7 @@ def _check_scale(field: HeightField, levelled: bool, remedy: str) -> None:
     if not (min(x, y) >= _MIN_PIXEL and max(x, y) <= _MAX_PIXEL and size <= _MAX_FIELD):
         raise RequestError(
             f"pixel_size: got {x:.4g} × {y:.4g} µm, a field of {size:.4g} µm, wanted pixels of {_MIN_PIXEL:g} to "
-            f"{_MAX_PIXEL:g} µm and at most {_MAX_FIELD:g} µm: is their unit right? pixel_size (--pixel-size), in µm, "
+            f"{_MAX_PIXEL:g} µm and at most {_MAX_FIELD:g} µm: is their unit right? pixel_size, in µm, "
             "sets them"
         )
     height_range = float(np.nanmax(field.heights) - np.nanmin(field.heights))
@@ -247,8 +248,7 @@ def _as_micrometres(numbers: NDArray, height_range: float | None) -> NDArray[np.
         return numbers.astype(np.float64)
     if height_range is None:
         raise RequestError(
-            f"height_range: missing for {numbers.dtype} heights, wanted the height in µm from black to white "
-            "(--height-range)"
+            f"height_range: missing for {numbers.dtype} heights, wanted the height in µm from black to white"
         )
     if not (is_number(height_range) and height_range > 0):
         raise RequestError(f"height_range: got {height_range!r}, wanted a positive number in µm")

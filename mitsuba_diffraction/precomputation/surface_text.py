@@ -1,0 +1,81 @@
+"""A surface on the command line, SURFACE[,name=value…]: its source, and values by the names that recipes have."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Mapping
+from contextlib import suppress
+from pathlib import Path
+from typing import Any
+
+from ..errors import RequestError, is_number
+from ..progress import say
+from ..surface.gratings import RENAMED
+from ..surface.prepare import step_of
+from .recipe import source_named
+
+_LISTS = ("pixel_size", "unit", "wavelengths", "prepare")
+"""Names that may be repeated, for a list."""
+
+
+def parsed(text: str) -> tuple[str, dict[str, Any]]:
+    """Return source, as `source_named`, and values; numbers, booleans, steps and repeated names as in a recipe.
+
+    The source is the longest beginning that is a file, as names of files may have commas.
+
+    Raises:
+        RequestError: if a part is not name=value, a name is repeated that has no list, or there is no such surface.
+    """
+    parts = text.split(",")
+    ends = range(len(parts), 1, -1)
+    end = next((end for end in ends if os.path.exists(",".join(parts[:end]))), 1)
+    source, values = ",".join(parts[:end]), dict[str, Any]()
+    for name, equals, value in (item.strip().partition("=") for item in parts[end:]):
+        if not (name and equals and value) or (name in values and name not in _LISTS):
+            got = f"{text}: got {name + equals + value!r}"
+            raise RequestError(f"{got}, wanted name=value, each name once{_no_lists(name)}")
+        found = step_of(value) if name == "prepare" else converted(value)
+        values[name] = [*values.get(name, []), found] if name in _LISTS else found
+    if source in RENAMED:
+        say("note", f"{source} is the measured skin; {RENAMED[source]} is a synthetic one")
+    single = {name: values[name][0] for name in _LISTS[:-1] if len(values.get(name, ())) == 1}
+    return source_named(source), values | single
+
+
+def _no_lists(name: str) -> str:
+    """Return what to do if a part is the end of a list or of a number with a decimal comma, or ""."""
+    return "; a number has a point, and a list of films stands in a scene" if is_number(converted(name)) else ""
+
+
+def written(source: str, values: Mapping[str, Any]) -> str:
+    """Return the text that `parsed` reads as this source and these values."""
+    items = [
+        f"{name}={_text(item)}"
+        for name, value in values.items()
+        for item in (value if isinstance(value, list | tuple) else [value])
+    ]
+    return ",".join([source, *items])
+
+
+def _text(value: object) -> str:
+    if isinstance(value, Mapping):  # a step of `prepare`
+        ((name, argument),) = value.items()
+        return f"{name}={argument}"
+    return str(value).lower() if isinstance(value, bool) else str(value)
+
+
+def converted(text: str) -> bool | int | float | str:
+    """Return a number, true or false, the absolute path of a file that exists, or the text."""
+    for kind in (int, float):
+        with suppress(ValueError):
+            return kind(text)
+    return {"true": True, "false": False}.get(text.lower(), absolute(text))
+
+
+def absolute(value: str) -> str:
+    """Return a file name on the command line, relative to the current folder, as an absolute one; other text as it is.
+
+    A bare word or number is not a file name, even if a file of that name exists.
+    """
+    is_file = os.path.isfile(value) and (os.path.dirname(value) or Path(value).suffix[1:2].isalpha())
+    return str(Path(value).resolve()) if is_file else value
