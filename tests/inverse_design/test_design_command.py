@@ -113,6 +113,18 @@ def test_a_negative_is_cast_and_dark_on_light_is_named(command):
     assert "note: paper.png is light up to its edges; --invert casts what is dark in it, with more contrast" in error
 
 
+def test_invert_is_not_advised_where_it_is_given(command):
+    picture = np.zeros((24, 24), np.uint8)
+    picture[8:12, 8:14] = 255
+    Image.fromarray(picture).save("night.png")
+    code, said, error = command(f"design night.png {OPTIONS} --invert")
+    assert (code, error) == (0, "")
+    assert "most of the picture is light: without --invert, its other parts are cast" in said
+    Image.fromarray(np.full_like(picture, 255)).save("white.png")
+    code, _, error = command("design white.png --invert")
+    assert (code, error.partition("got ")[2]) == (2, "white alone, wanted light somewhere\n")
+
+
 def test_a_target_is_upright_as_its_exif_data_say():
     exif = Image.Exif()
     exif[0x0112] = 6  # its first row is shown on the right
