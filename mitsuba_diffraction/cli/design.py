@@ -21,7 +21,7 @@ from ..files.picture_file import read_picture
 from ..inverse_design import Design, Verdict, makers
 from ..inverse_design import design as search
 from ..inverse_design.output import SUFFIXES, save
-from ..inverse_design.plate import for_detail, resolved_strokes
+from ..inverse_design.plate import depth_for_strokes, for_detail, resolved_strokes
 from ..inverse_design.search import WHITE
 from ..inverse_design.target import finest_strokes
 from ..precomputation.surface_text import converted
@@ -51,7 +51,10 @@ def design(
             "--texels, and --angle if need be"
         ),
     ] = None,
-    height_range: Annotated[float, typer.Option(help="largest difference of heights, µm")] = 0.8,
+    height_range: Annotated[
+        float | None,
+        typer.Option(help="largest difference of heights, µm; default: 0.8, or more for fine strokes in white light"),
+    ] = None,
     angle: Annotated[
         float, typer.Option(help="degrees from the mirror direction to the middle of an edge of the picture")
     ] = 17.5,
@@ -101,16 +104,24 @@ def design(
     wavelengths = None if wavelength is None else parse_numbers("--wavelength", wavelength).tolist()
     options = _OPTIONS | {"target": str(target)}
     strokes, longest, note = finest_strokes(picture), max(wavelengths or WHITE), ""
+    index = None if int_ior is None else converted(int_ior)
+    if height_range is None:
+        with named_as_options(options):
+            height_range = depth_for_strokes(strokes if detail is None else detail, wavelengths or WHITE, index)
     if detail is not None:
         if texels is not None:
             raise RequestError(f"--detail: got {detail:g} and --texels {texels}, wanted one of them")
         with named_as_options(options):
             texels, angle = for_detail(detail, texel, angle, longest)
-        note = f"{texels} texels along the period, angle {angle:g}°, for strokes of 1/{detail:g} of the picture"
+        note = (
+            f"{texels} texels along the period, {height_range:g} µm deep, angle {angle:g}°, for strokes of "
+            f"1/{detail:g} of the picture"
+        )
     elif texels is None:
         fitting = math.ceil(_LEGIBLE * strokes / resolved_strokes(1, texel, angle, longest))
         texels = min(max(fitting, _MIN_TEXELS), _MAX_TEXELS)
-        note = f"{texels} texels along the period; the finest strokes are 1/{strokes:.0f} of the picture"
+        finest = f"the finest strokes are 1/{strokes:.0f} of the picture"
+        note = f"{texels} texels along the period, {height_range:g} µm deep; {finest}"
     bar = progress_bar(f"design of {target.name}", "iterations")
     with named_as_options(options), bar as progress, _sigterm_interrupts():
         found = search(
@@ -120,7 +131,7 @@ def design(
             height_range,
             angle,
             wavelengths,
-            None if int_ior is None else converted(int_ior),
+            index,
             levels,
             seen_on=seen_on,
             unused=unused,

@@ -18,6 +18,8 @@ _MAX_TEXELS = 256
 _ORDERS_PER_STROKE = 3.0  # of the finest strokes of a picture; see the eye chart in docs/design.md
 _MAX_ANGLE = 30.0  # degrees, that `for_detail` takes
 _MAX_PATH = 16.0  # largest path difference in wavelengths; deeper reliefs are far outside of scalar theory
+_HEIGHT_RANGE = 0.8  # µm, at least
+_FACET_SPREAD = 0.886  # full width at half maximum of (sin x/x)², in λ/L
 _MARGIN = 1.2  # of the wavelengths of invisible light, by which its spectrum covers more than the design
 
 
@@ -52,6 +54,28 @@ def for_detail(detail: float, texel: float, angle: float, wavelength: float) -> 
 def resolved_strokes(texels: int, texel: float, angle: float, wavelength: float) -> float:
     """Return how many of the finest strokes that a plate resolves fit along an edge; arguments as of `for_detail`."""
     return 2 * texels * texel * math.sin(math.radians(angle)) / (_ORDERS_PER_STROKE * wavelength * 1e-3)
+
+
+def depth_for_strokes(strokes: float, wavelengths: ArrayLike, int_ior: float | str | None = None) -> float:
+    """Return the height range in µm with which strokes of 1/`strokes` of an edge are sharp at the edge of the picture.
+
+    Light of many wavelengths is directed by facets. One that directs it to the edge, at the direction cosine s, has a
+    slope of s/p, with the path p per height, and L = h p/s fits into the height range h. Its light spreads by
+    0.886 λ/L, which is a stroke, 2 s/`strokes`, at h = 0.443 λ strokes/p, whatever s. Light of one wavelength needs no
+    more than the smallest height range, as steps of whole wavelengths continue its facets.
+
+    Args:
+        strokes: number of the finest strokes along an edge of the picture.
+        wavelengths: nm.
+        int_ior: index of a sheet, as of `Plate`.
+    """
+    light = np.atleast_1d(np.asarray(wavelengths, np.float64)) * 1e-3
+    path = np.full(light.shape, 2.0) if int_ior is None else index_of("int_ior", int_ior)(light).real - 1
+    if light.size == 1 or path.min() <= 0:
+        return _HEIGHT_RANGE
+    per_height = light / path
+    depth = min(_FACET_SPREAD / 2 * strokes * float(per_height.mean()), _MAX_PATH * float(per_height.min()))
+    return max(_HEIGHT_RANGE, math.floor(10 * depth) / 10)
 
 
 @dataclass(frozen=True, eq=False)

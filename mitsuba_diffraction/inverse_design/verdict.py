@@ -7,7 +7,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from .plate import Plate, resolved_strokes
+from .plate import Plate, depth_for_strokes, resolved_strokes
 from .result import Design
 
 # Fraction of the light in the picture, contrast, correlation with the target: at least these, means over wavelengths.
@@ -17,6 +17,7 @@ VISIBLE_BOUNDS = (0.3, 0.3, 0.6)
 COLOUR_BOUNDS = {"good": 10.0, "fair": 15.0}
 _MAX_STEP = 0.45  # of levels, in wavelengths of path difference; larger ones send light into the mirror direction
 _MIN_PATH = 0.75  # of the whole relief, in wavelengths
+_SHALLOW = 0.75  # of the depth for the finest strokes
 _MAX_LIT = 0.6  # fraction of the frame that is light
 _NO_PIGMENTS = "one relief has no three pigments: all wavelengths follow the same slopes"
 
@@ -95,6 +96,10 @@ def _remedy(design: Design, strokes: float | None, inverted: bool) -> str:
     if design.inside.mean() > _MAX_LIT:
         option = "without --invert, its other parts are cast" if inverted else "--invert casts its dark parts instead"
         return f"most of the picture is light: {option}"
+    if strokes is not None and plate.levels is None:
+        deep = depth_for_strokes(strokes, plate.wavelengths, plate.int_ior)
+        if plate.height_range < _SHALLOW * deep:
+            return f"facets are too short for its strokes in light of many wavelengths: --height-range {deep:.2g}"
     resolved = resolved_strokes(plate.texels, plate.texel, plate.angle, float(plate.wavelengths.max()))
     if strokes is not None and strokes > resolved:
         return (

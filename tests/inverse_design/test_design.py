@@ -12,7 +12,7 @@ import mitsuba_diffraction as md
 from mitsuba_diffraction.inverse_design import Design, Verdict
 from mitsuba_diffraction.inverse_design.far_field import nearest_levels
 from mitsuba_diffraction.inverse_design.output import save
-from mitsuba_diffraction.inverse_design.plate import Plate
+from mitsuba_diffraction.inverse_design.plate import Plate, depth_for_strokes
 from mitsuba_diffraction.inverse_design.search import WHITE
 from mitsuba_diffraction.inverse_design.target import wanted_fractions
 from mitsuba_diffraction.inverse_design.verdict import COLOUR_BOUNDS, GOOD_BOUNDS, VISIBLE_BOUNDS
@@ -244,6 +244,25 @@ def unsearched(wavelengths, target=None, **options):
     heights = np.random.default_rng(0).uniform(0, plate.height_range, 2 * (plate.texels,))
     wanted = wanted_fractions(lopsided() if target is None else target, plate)
     return Design.of(heights, plate, wanted[..., ::-1] if plate.mirrored else wanted)
+
+
+@pytest.mark.slow
+def test_strokes_far_from_the_mirror_direction_are_sharp_in_white_light():
+    """The first letter of WAVE was a #: facets of a relief of 0.8 µm are too short to tell its strokes apart."""
+    strokes = np.zeros((30, 100))
+    for left in range(2, 100, 8):
+        strokes[5:25, left : left + 4] = 1
+    outer = {}
+    for depth in (0.8, depth_for_strokes(25, WHITE)):
+        found = md.design(strokes, texels=72, starts=2, height_range=depth)
+        wanted, predicted = (light.sum(axis=1) for light in (found.wanted, found.predicted))
+        lit = wanted[0] > 0.5 * wanted[0].max()
+        at_edge = np.abs(np.linspace(-1, 1, lit.size)) > 0.6
+        bright, dark = (predicted[:, at_edge & side].mean(axis=1) for side in (lit, ~lit))
+        outer[depth] = float(np.mean((bright - dark) / (bright + dark)))
+    shallow, deep = outer.values()
+    assert deep > 0.15
+    assert shallow < 0.05
 
 
 def test_a_design_in_infrared_is_that_of_shorter_light_in_larger_lengths():

@@ -68,7 +68,7 @@ def test_files_for_makers_are_written(command):
 def test_texels_follow_from_the_detail(command):
     code, _, error = command("design flag.png --texel 1 --wavelength 532 --starts 1 --detail 4")
     assert code == 0
-    assert "note: 11 texels along the period, angle 17.5°, for strokes of 1/4 of the picture" in error
+    assert "note: 11 texels along the period, 0.8 µm deep, angle 17.5°, for strokes of 1/4 of the picture" in error
 
 
 def test_texels_follow_from_the_finest_strokes_of_the_picture(command):
@@ -79,7 +79,7 @@ def test_texels_follow_from_the_finest_strokes_of_the_picture(command):
     assert finest_strokes(np.pad(np.ones((3, 20)), 10)) == pytest.approx(40 / 3, rel=0.2)
     code, _, error = command("design flag.png --wavelength 532 --height-range 0.3 --starts 1")
     assert code == 0
-    assert "note: 32 texels along the period; the finest strokes are 1/7 of the picture" in error
+    assert "note: 32 texels along the period, 0.3 µm deep; the finest strokes are 1/7 of the picture" in error
 
 
 def test_a_target_is_a_picture_as_seen_on_a_screen():

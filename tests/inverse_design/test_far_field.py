@@ -8,7 +8,7 @@ import scipy.integrate
 import scipy.ndimage
 
 from mitsuba_diffraction.inverse_design.far_field import blurred_texels, lobes_in_bins, nearest_levels
-from mitsuba_diffraction.inverse_design.plate import Plate, for_detail
+from mitsuba_diffraction.inverse_design.plate import Plate, depth_for_strokes, for_detail
 from mitsuba_diffraction.inverse_design.search import far_field_of
 from mitsuba_diffraction.inverse_design.target import wanted_fractions, with_unused
 from mitsuba_diffraction.scalar_theory.reference import order_powers
@@ -129,6 +129,26 @@ def test_a_detail_has_three_orders(detail):
     orders = 2 * np.sin(np.deg2rad(angle)) * texels * 0.8 / 0.532
     assert 3 * detail <= orders < 3 * detail * 1.02 + 2
     assert angle == 17.5 or texels > 250
+
+
+@pytest.mark.parametrize(("edge", "int_ior"), [(0.3, None), (0.15, None), (0.3, 1.5)])
+def test_a_facet_of_the_default_depth_spreads_light_over_one_stroke(edge, int_ior):
+    """The width of the light that a single facet directs to the edge, by the diffraction integral."""
+    strokes, wavelength = 20, 0.54
+    depth = depth_for_strokes(strokes, [539.0, 541.0], int_ior)
+    path = 2.0 if int_ior is None else int_ior - 1
+    x = np.linspace(0, depth * path / edge, 2001)  # a rise of path edge/path · x
+    direction = np.linspace(edge - 2 / strokes, edge + 2 / strokes, 801)
+    amplitude = np.exp(2j * np.pi / wavelength * (edge - direction[:, None]) * x).mean(axis=1)
+    bright = direction[np.abs(amplitude) ** 2 > 0.5]
+    assert np.ptp(bright) == pytest.approx(2 * edge / strokes, rel=0.05)
+
+
+def test_light_of_one_wavelength_and_coarse_strokes_take_the_smallest_depth():
+    assert depth_for_strokes(60, 532.0) == depth_for_strokes(4, [430.0, 670.0]) == 0.8
+    # No more than 16 wavelengths of path difference, which a plate accepts.
+    assert Plate(0.8, 64, depth_for_strokes(500, [430.0, 670.0]), 17.5, np.array([430.0, 670.0]), None, None, 0.1)
+    assert depth_for_strokes(500, [430.0, 670.0]) == 3.4
 
 
 def test_finer_detail_than_a_plate_resolves_is_refused():
