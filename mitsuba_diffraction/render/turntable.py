@@ -31,7 +31,7 @@ def orbit(scene_file: SceneFile, frames: int) -> list[tuple[float, ...]]:
 
     Frame k rotates it by 360° k/`frames` about the coordinate axis closest to its up vector, through the point on its
     line of sight that is closest to the centre of the scene's bounding box. Each motion is an affine map of world
-    space; the first is the identity. For errors see `SceneFile.load`.
+    space; the first is the identity. Lamps are outside of the box. For errors see `SceneFile.load`.
     """
     scene = replace(scene_file, size=(1, 1)).load()
     target, up = _view(scene)
@@ -48,7 +48,10 @@ def _view(scene: mi.Scene) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     """Return the point the first camera looks at, and the coordinate axis closest to its up vector."""
     to_world = np.array(scene.sensors()[0].world_transform().matrix, np.float64).reshape(4, 4)
     origin, forward, own_up = to_world[:3, 3], to_world[:3, 2] / np.linalg.norm(to_world[:3, 2]), to_world[:3, 1]
-    centre = np.ravel(np.array(scene.bbox().center(), np.float64))
+    bbox = mi.ScalarBoundingBox3f()
+    for shape in [shape for shape in scene.shapes() if not shape.is_emitter()] or scene.shapes():
+        bbox.expand(shape.bbox())
+    centre = np.ravel(np.array(bbox.center(), np.float64))
     axis = int(np.argmax(np.abs(own_up)))
     up = np.zeros(3)
     up[axis] = np.sign(own_up[axis])

@@ -594,6 +594,12 @@ def test_the_orbit_runs_around_the_target():
         np.testing.assert_allclose(camera(motion), camera(None, "moved.xml"), atol=1e-6)
 
 
+def test_lamps_do_not_displace_the_orbit():
+    lamp = '<shape type="sphere"><point name="center" x="3" y="9" z="7"/><emitter type="area"/></shape></scene>'
+    Path("scene.xml").write_text(SCENE.replace("RFILTER", "box").replace("</scene>", lamp))
+    np.testing.assert_allclose(camera(orbit(SceneFile("scene.xml"), 2)[1])[:3, 3], [0, 4, 2], atol=1e-6)
+
+
 def test_parameters_and_matrices_place_the_orbit():
     text = SCENE.replace("RFILTER", "box")
     Path("scene.xml").write_text(
