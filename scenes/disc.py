@@ -10,20 +10,11 @@ from __future__ import annotations
 from pathlib import Path
 
 import numpy as np
-from modelling import Array, command, write_sheets
+from modelling import Array, command, revolved, write_sheets
 
 THICKNESS = 0.12
 HOLE, METAL, RIM, EDGE = 0.75, 2.3, 5.85, 6.0
 TABLE_ROTATION, TABLE_HALF_SIDE = np.deg2rad(68), 400  # as in compact_disc.xml and rainbow.xml
-
-
-def ring(inner: tuple[float, float], outer: tuple[float, float], count: int) -> tuple[Array, Array, Array]:
-    """Return the sheet between two circles, each given by (radius, height)."""
-    u, v = np.linspace(0, 1, 3), np.linspace(0, 1, count + 1)
-    radius, height = ((1 - u) * a + u * b for a, b in zip(inner, outer, strict=True))
-    phi = 2 * np.pi * v[:, None]
-    points = np.stack([radius * np.cos(phi), radius * np.sin(phi), height + 0 * phi], -1)
-    return points, u, v
 
 
 def uv_of_table(points: Array) -> Array:
@@ -36,18 +27,18 @@ def uv_of_table(points: Array) -> Array:
 def make(folder: Path, count: int = 1024) -> None:
     """Write disc_metal.ply and disc_clear.ply, circles of `count` corners."""
     top = THICKNESS
-    write_sheets(folder / "disc_metal.ply", [ring((METAL, top), (RIM, top), count)])
+    write_sheets(folder / "disc_metal.ply", [revolved([(METAL, top), (RIM, top)], count)])
     clear = [
-        ring((HOLE, top), (1.68, top), count),
+        revolved([(HOLE, top), (1.68, top)], count),
         # The raised ring that separates the discs of a stack.
-        ring((1.68, top), (1.70, top + 0.03), count),
-        ring((1.70, top + 0.03), (1.76, top + 0.03), count),
-        ring((1.76, top + 0.03), (1.78, top), count),
-        ring((1.78, top), (METAL, top), count),
-        ring((RIM, top), (EDGE - 0.02, top), count),
-        ring((EDGE - 0.02, top), (EDGE, top - 0.02), count),
-        ring((EDGE, top - 0.02), (EDGE, 0.0), count),
-        ring((HOLE, 0.0), (HOLE, top), count),
+        revolved([(1.68, top), (1.70, top + 0.03)], count),
+        revolved([(1.70, top + 0.03), (1.76, top + 0.03)], count),
+        revolved([(1.76, top + 0.03), (1.78, top)], count),
+        revolved([(1.78, top), (METAL, top)], count),
+        revolved([(RIM, top), (EDGE - 0.02, top)], count),
+        revolved([(EDGE - 0.02, top), (EDGE, top - 0.02)], count),
+        revolved([(EDGE, top - 0.02), (EDGE, 0.0)], count),
+        revolved([(HOLE, 0.0), (HOLE, top)], count),
     ]
     write_sheets(folder / "disc_clear.ply", clear, uv_of_table)
 

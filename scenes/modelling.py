@@ -20,6 +20,7 @@ from mitsuba_diffraction.files.writing import whole_file
 import mitsuba as mi  # isort: skip  (after LLVM has been chosen)
 
 Array = NDArray[np.float64]
+Sheet = tuple[Array, Array, Array]  # points (n_v, n_u, 3), u (n_u,) and v (n_v,)
 
 MODELS = Path(__file__).parent / "models"
 
@@ -32,15 +33,12 @@ def command(make: Callable[[Path], None], folder: Path = MODELS) -> None:
     print(f"{Path(sys.argv[0]).stem}: written to {folder}, {time.perf_counter() - start:.1f} s")
 
 
-def write_sheets(
-    path: Path, sheets: Sequence[tuple[Array, Array, Array]], uv: Callable[[Array], Array] | None = None
-) -> None:
+def write_sheets(path: Path, sheets: Sequence[Sheet], uv: Callable[[Array], Array] | None = None) -> None:
     """Write sheets as one mesh (.ply) with normals and UVs: two triangles for each quad of the grid.
 
     Args:
         path: of the mesh.
-        sheets: (points, u, v) each, of shapes (n_v, n_u, 3), (n_u,) and (n_v,). Where the first and the last row
-            or column coincide, the surface is closed.
+        sheets: where the first and the last row or column coincide, the surface is closed.
         uv: UVs (n, 2) of points (n, 3), instead of u and v.
     """
     vertices, normals, uvs, faces, count = [], [], [], [], 0
@@ -76,6 +74,20 @@ def _difference(points: Array, axis: int) -> Array:
         difference = np.roll(inner, -1, axis) - np.roll(inner, 1, axis)
         return np.concatenate([difference, difference.take([0], axis)], axis)
     return np.gradient(points, axis=axis)
+
+
+def quad(corners: Sequence[Sequence[float]]) -> Sheet:
+    """Return a quadrilateral, its corners in the order of their (u, v): (0, 0), (1, 0), (0, 1), (1, 1)."""
+    unit = np.array([0.0, 1.0])
+    return np.reshape(np.asarray(corners, np.float64), (2, 2, 3)), unit, unit
+
+
+def revolved(profile: Sequence[Sequence[float]] | Array, count: int) -> Sheet:
+    """Return a surface of revolution about z: (radius, height) along u, from the inside outwards, `count` corners."""
+    radius, height = np.transpose(profile)
+    u, v = np.linspace(0, 1, len(radius)), np.linspace(0, 1, count + 1)
+    phi = 2 * np.pi * v[:, None]
+    return np.stack([radius * np.cos(phi), radius * np.sin(phi), height + 0 * phi], -1), u, v
 
 
 def write_colours(path: Path, srgb: Array) -> None:

@@ -71,7 +71,7 @@ def test_every_picture_has_a_reference():
     models, renderings = gallery.commands(PAGES)
     assert len(renderings) == 23
     assert {words[1] for words in models} == {
-        f"scenes/{name}.py" for name in ("snake", "disc", "foil", "hologram", "anodised", "beetle", "ground")
+        f"scenes/{name}.py" for name in ("snake", "disc", "foil", "hologram", "anodised", "beetle", "street", "ground")
     }
     assert set(gallery.load(gallery.REFERENCES)) == set(renderings)
     for words in renderings.values():
