@@ -75,12 +75,13 @@ def page(surface: Surface, *others: Surface, picture: NDArray[np.float16] | None
     around = len(text.encode()) + sum(len(part.encode()) for part in parts.values())
     data = []
     for index, one in enumerate((surface, *others)):
-        data.append(_json(_data(one, picture if index == 0 else None)))
+        of_one = _data(one, picture if index == 0 else None)
+        data.append(_json(of_one))
         if (size := around + len(data[-1].encode())) > MAX_PAGE_BYTES:
             raise RequestError(
                 f"{one.name}: got a page of {size / 1e6:.3g} MB, wanted at most {MAX_PAGE_BYTES / 1e6:g}; a larger "
                 "tolerance or a shorter coherence length makes its table smaller"
-                + _suggestion(one, (MAX_PAGE_BYTES - around) / (size - around))
+                + _suggestion(one, 1 - (size - MAX_PAGE_BYTES) / len(of_one["spectrum"]["table"]["data"]))
             )
     tags = (f'<script id="data{i or ""}" type="application/json">{one}</script>' for i, one in enumerate(data))
     parts |= {"data": "\n".join(tags), "names": _json(names)}
