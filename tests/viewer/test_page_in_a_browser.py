@@ -565,6 +565,52 @@ def test_the_first_frame_has_no_visible_noise(disc, opened):
 
 
 @pytest.mark.slow
+def shown_at(tab, point, back, distance):
+    """The largest channel of what is shown where a point is seen by a camera towards `back`, 0 to 255."""
+    right = np.cross([0, 0, 1], back) / np.hypot(back[0], back[1])
+    up = np.cross(back, right)
+    # A field of view of 28° along the shorter side.
+    tangent = np.array([right @ point, up @ point]) / (distance - back @ point) / np.tan(np.radians(14))
+    return tab.evaluate(
+        """(tangent) => {
+          viewer.renderer.drawScreen(viewer.state, [0, 0, 0]);
+          const gl = document.getElementById('canvas').getContext('webgl2');
+          const size = [gl.drawingBufferWidth, gl.drawingBufferHeight];
+          const at = size.map((n, i) => Math.floor(0.5 * (n + tangent[i] * Math.min(...size))));
+          const found = new Uint8Array(4);
+          gl.bindFramebuffer(gl.FRAMEBUFFER, null);
+          gl.readPixels(at[0], at[1], 1, 1, gl.RGBA, gl.UNSIGNED_BYTE, found);
+          return Math.max(...found.slice(0, 3));
+        }""",
+        tangent.tolist(),
+    )
+
+
+def test_a_sphere_casts_a_shadow_on_the_ground_and_mirrors_the_lamp(opened):
+    tab = opened(Surface.named("blazed", {"depth": 0.1, "samples": 64, "coherence_length": 3.0, "material": "Al"}))
+    elevation, distance = np.radians(40), 8
+    back = np.array([0, -np.cos(elevation), np.sin(elevation)])
+    # The light is 45° high, towards +x and then -x: the shadow of the centre of the sphere falls on the other side.
+    for azimuth, side in ((0, 1), (180, -1)):
+        tab.evaluate(
+            "(lightAzimuth) => viewer.set({ maxFrames: 1, shape: 'sphere', azimuth: -90, elevation: 40, distance: 8, "
+            "lightAzimuth, lightElevation: 45, lightWidth: 6, lightLength: 0, sky: 0.05 })",
+            azimuth,
+        )
+        wait_for_frames(tab)
+        lit, dark = (shown_at(tab, np.array([x * side, 0, -1]), back, distance) for x in (1.4, -1.4))
+        assert lit > 1.3 * dark > 0
+    # The normal halfway between light and eye mirrors the lamp.
+    light = np.array([-1, 0, 1]) / 2**0.5
+    normal = light + back
+    for _ in range(20):
+        normal /= np.linalg.norm(normal)
+        towards_eye = distance * back - normal
+        normal = light + towards_eye / np.linalg.norm(towards_eye)
+    normal /= np.linalg.norm(normal)
+    assert shown_at(tab, normal, back, distance) > 240
+
+
 def test_a_disc_has_a_hole_and_clear_rings(disc, opened):
     tab = opened(disc)
     assert tab.evaluate("[viewer.state.shape, viewer.state.material, viewer.state.coat]") == ["disc", "Al", 1.55]

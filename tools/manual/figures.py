@@ -115,8 +115,8 @@ FIGURES = (
     ),
     Figure(
         ("viewer.png", "viewer_snake.png"),
-        """python tools/manual/viewer_picture.py {out}/viewer.png
-        python tools/manual/viewer_picture.py {out}/viewer_snake.png --surface xenopeltis""",
+        """python tools/manual/viewer_picture.py {out}/viewer.png --frames 3
+        python tools/manual/viewer_picture.py {out}/viewer_snake.png --surface xenopeltis --frames 3""",
         needs="Chromium (tools/manual/live_browser.py)",
     ),
 )

@@ -14,8 +14,6 @@ from pathlib import Path
 from live_browser import draw, opened
 from live_pages import SURFACES
 
-FRAMES = 16
-
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
@@ -23,12 +21,13 @@ def main() -> None:
     parser.add_argument("--surface", choices=SURFACES, default="compact_disc")
     parser.add_argument("--with", dest="right", default="none", help="the other side: flss, nmm, …")
     parser.add_argument("--dark", action="store_true")
+    parser.add_argument("--frames", type=int, default=16)
     parser.add_argument("--width", type=int, default=960)
     parser.add_argument("--height", type=int, default=560)
     options = parser.parse_args()
     size = {"width": options.width, "height": options.height}
     with opened(options.surface, viewport=size, color_scheme="dark" if options.dark else "light") as tab:
-        draw(tab, {"right": options.right}, FRAMES)
+        draw(tab, {"right": options.right}, options.frames)
         tab.screenshot(path=options.output)
 
 

@@ -11,6 +11,8 @@ uniform bool uDifference;
 uniform float uScale;           // of the drawn part of the mean
 uniform float uSmooth;          // how much of a mean over a tile is shown, see shade.glsl
 uniform float uOtherSmooth;
+uniform bool uHasGround;
+uniform vec2 uScreen;           // its size in pixels
 out vec4 oColour;
 
 vec3 toLinear(vec3 xyz) {
@@ -155,6 +157,10 @@ vec4 smoothed(highp sampler2D picture, vec2 at, float amount) {
 
 const float MAX_DELTA_E = 30.0;
 
+vec3 toLinearChannels(vec3 encoded) {
+  return mix(pow((encoded + 0.055) / 1.055, vec3(2.4)), encoded / 12.92, lessThanEqual(encoded, vec3(0.04045)));
+}
+
 void main() {
   vec4 mean = smoothed(uMean, gl_FragCoord.xy * uScale, uSmooth);
   vec3 ours = shown(ofMean(mean), uExposure);
@@ -165,11 +171,15 @@ void main() {
   }
   vec3 theirs = shown(uOtherIsPicture ? found.rgb : ofMean(found), uOtherExposure);
   float cover = uOtherIsPicture ? 1.0 : found.a;
-  vec3 colour = mix(uBackground, encode(ours), mean.a);
+  vec3 background = uBackground;
+  if (min(mean.a, cover) < 1.0 && uHasGround) {
+    background = encode(withGround(toLinearChannels(uBackground), 2.0 * gl_FragCoord.xy / uScreen - 1.0));
+  }
+  vec3 colour = mix(background, encode(ours), mean.a);
   if (uDifference) {
     colour = mix(uBackground, heat(deltaE(toLab(ours), toLab(theirs)) / MAX_DELTA_E), min(mean.a, cover));
   } else if (gl_FragCoord.x > uDivider) {
-    colour = mix(uBackground, encode(theirs), cover);
+    colour = mix(background, encode(theirs), cover);
   }
   if (abs(gl_FragCoord.x - uDivider) < 1.0 && !uDifference) colour = vec3(0.5);
   oColour = vec4(colour, 1.0);

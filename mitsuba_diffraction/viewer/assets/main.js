@@ -9,7 +9,7 @@ const PREVIEW_SCALE = 0.25;
 
 const shapeOf = (data) => (data.shape === "coil" && !data.coil ? "sphere" : data.shape);
 
-// A skin on a snake, a designed plate before its wall, a disc beside a strip that casts its rainbows; other surfaces on a
+// A skin on a snake, a designed plate before its wall, a disc that mirrors a small lamp; other surfaces on a
 // plate or a sphere, in a sky that shows a metal as metal.
 function firstView(data) {
   if (shapeOf(data) === "coil") {
@@ -23,8 +23,8 @@ function firstView(data) {
       lightWidth: 0.5, lightLength: 0, sky: 0, hasBase: false, pigment: "#141a22" };
   }
   if (shapeOf(data) === "disc") {
-    return { azimuth: -90, elevation: 45, distance: 4.6, lightAzimuth: 0, lightElevation: 50,
-      lightWidth: 5, lightLength: 50, sky: 0.05, hasBase: isDielectric, pigment: "#141a22" };
+    return { azimuth: -90, elevation: 45, distance: 4.6, lightAzimuth: 74, lightElevation: 50,
+      lightWidth: 2, lightLength: 0, sky: 0.05, hasBase: isDielectric, pigment: "#141a22" };
   }
   const lines = data.spectrum.max_order.includes(0);
   return { azimuth: -90, elevation: 20, distance: 5.2, lightAzimuth: -75, lightElevation: 35,

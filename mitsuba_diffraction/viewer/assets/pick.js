@@ -90,7 +90,7 @@ class Picker {
     const orders = this.ordersOf(found);
     const xyz = coloursOf(values);
     const rgb = toRGB(xyz);
-    const hex = `#${this.renderer.displayed(xyz).map((c) => Math.round(255 * c).toString(16).padStart(2, "0")).join("")}`;
+    const hex = `#${this.renderer.displayed(xyz, this.state).map((c) => Math.round(255 * c).toString(16).padStart(2, "0")).join("")}`;
     $("swatch").hidden = !(xyz[1] > 0);
     $("swatch").style.background = hex;
     const angle = (v) => `${((Math.acos(Math.min(Math.max(v[2], -1), 1)) * 180) / Math.PI).toFixed(1)}°`;

@@ -67,11 +67,12 @@ class Renderer {
     this.matching = numbers2D(gl, tables.light, 471, 1, 4);
     this.analytic = new Program(gl, SHADERS.quad_vertex, SHADERS.analytic);
     this.mesh = new Program(gl, SHADERS.mesh_vertex, SHADERS.scales, SHADERS.mesh);
-    this.screen = new Program(gl, SHADERS.quad_vertex, SHADERS.display);
+    this.screen = new Program(gl, SHADERS.quad_vertex, SHADERS.ground, SHADERS.display);
     const constants = (state) => this.constants(state);
     this.model = new Side(gl, SHADERS.model + SHADERS.radiance_model, constants, (state, frame) => this.modelUniforms(state, frame));
     this.programs = new Map();
     this.coil = tables.coil;
+    this.noFootprint = numbers2D(gl, new Float32Array(1), 1, 1, 1);
     this.empty = gl.createVertexArray();
     this.shader = null;
     this.picture = tables.picture;
@@ -226,6 +227,24 @@ class Renderer {
     }
   }
 
+  // The ground as it is seen, for display.glsl.
+  groundUniforms(state) {
+    const camera = cameraOf(state, this.width, this.height);
+    const isCoil = state.shape === "coil";
+    return {
+      uHasGround: Number(!state.difference || state.right === "none"),
+      uShape: isCoil ? Object.keys(ANALYTIC).length : ANALYTIC[state.shape],
+      uEye: camera.eye,
+      uCamera: [...camera.right, ...camera.up, ...camera.back],
+      uTangentOfView: camera.tangents,
+      uGround: isCoil ? this.coil.lowest : GROUND_HEIGHTS[state.shape] || 0,
+      uLight: lightOf(state),
+      uHalfWidth: lightSizeOf(state).uLightSize[0],
+      uRings: this.data.rings || [0, 0, 1],
+      uFootprint: isCoil ? this.coil.footprint : this.noFootprint,
+    };
+  }
+
   drawScreen(state, background) {
     const { gl } = this;
     gl.bindFramebuffer(gl.FRAMEBUFFER, null);
@@ -235,6 +254,8 @@ class Renderer {
     const other = isPicture ? picture.texture : (this.shader || this.model).mean.textures[0];
     const exposure = 2 ** state.exposure;
     this.screen.use({
+      ...this.groundUniforms(state),
+      uScreen: [gl.drawingBufferWidth, gl.drawingBufferHeight],
       uMean: this.model.mean.textures[0],
       uOther: other,
       uSmooth: smoothingOf(this.model.frame),
@@ -252,12 +273,13 @@ class Renderer {
   }
 
   // Encoded sRGB of XYZ as it is shown where its brightest channel is at the shoulder, 0 to 1.
-  displayed(xyz) {
+  displayed(xyz, state) {
     const { gl } = this;
     const target = new Target(gl, 1, 1);
     target.bind();
     const uMean = numbers2D(gl, Float32Array.from([...xyz, 1]), 1, 1, 4);
     this.screen.use({
+      ...this.groundUniforms(state), uHasGround: 0, uScreen: [1, 1],
       uMean, uOther: uMean, uSmooth: 0, uOtherSmooth: 0, uScale: 1, uOtherScale: [1, 1, 0, 0], uOtherIsPicture: 0,
       uExposure: 0.8 / Math.max(...toRGB(xyz), 1e-30), uOtherExposure: 1, uDivider: 1e6, uDifference: 0, uBackground: [0, 0, 0],
     });

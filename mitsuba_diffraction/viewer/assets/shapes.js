@@ -2,6 +2,8 @@
 
 const SCALES = { none: 0, elaphe: 1, xenopeltis: 2 };
 const ANALYTIC = { sphere: 0, plate: 1, disc: 2, wall: 3 };
+const GROUND_HEIGHTS = { sphere: -1, plate: -0.06, disc: -0.06 };
+const FOOTPRINT = { size: 96, edge: 1.6, blur: 2 };  // texels, half the edge, texels; see ground.glsl
 
 class Mesh {
   // A sheet of points (rows, columns), closed along its rows; the tangent and u follow the columns, by `step` each.
@@ -61,5 +63,25 @@ async function coilOf(gl, coil) {
   for (let i = 0; i < values.length; i++) {
     points[i] = scale * (coil.origin[i % 3] + coil.step[i % 3] * values[i] - middle[i % 3]);
   }
-  return { mesh: new Mesh(gl, points, rows, columns, coil.step_of_u), middle, scale };
+  let lowest = Infinity;
+  for (let i = 2; i < points.length; i += 3) lowest = Math.min(lowest, points[i]);
+  return { mesh: new Mesh(gl, points, rows, columns, coil.step_of_u), middle, scale, lowest, footprint: footprintOf(gl, points) };
+}
+
+// Which part of the ground is below points, as a texture, blurred.
+function footprintOf(gl, points) {
+  const { size, edge, blur } = FOOTPRINT;
+  let values = new Float32Array(size * size);
+  for (let i = 0; i < points.length; i += 3) {
+    const [x, y] = [0, 1].map((k) => Math.floor((0.5 + (0.5 * points[i + k]) / edge) * size));
+    if (Math.min(x, y) >= 0 && Math.max(x, y) < size) values[y * size + x] = 1;
+  }
+  for (const step of [1, size, 1, size]) {
+    values = values.map((_, i) => {
+      let sum = 0;
+      for (let k = -blur; k <= blur; k++) sum += values[i + k * step] || 0;
+      return sum / (2 * blur + 1);
+    });
+  }
+  return numbers2D(gl, values, size, size, 1);
 }
