@@ -15,7 +15,7 @@ TABLE = list(figures.figures())
 
 
 def test_every_picture_of_the_manual_stands_in_the_table_once():
-    pictures = [path for path in DOCS.rglob("*") if path.suffix in (".png", ".jpg", ".svg", ".gif")]
+    pictures = [path for path in DOCS.rglob("*") if path.suffix in (".png", ".jpg", ".svg", ".gif", ".webp")]
     files = [file for figure in TABLE for file in figure.files]
     assert sorted(files) == sorted(path.relative_to(DOCS).as_posix() for path in pictures)
 

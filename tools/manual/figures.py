@@ -90,6 +90,12 @@ FIGURES = (
         ("measured_gratings.png", "measured_transmission.png"),
         "python tools/manual/measured_figures.py {out}/measured_gratings.png {out}/measured_transmission.png",
     ),
+    Figure(
+        ("orbit.webp",),
+        """mitsuba-diffraction render scenes/compact_disc.xml -D table=dark --exposure 2.8 --width 320 --height 180 \
+            --spp 9 --denoise --orbit --frames 30 -o {out}/orbit.png""",
+        3,
+    ),
     notebook("patch_length.png", "02_brdf_and_grating_equation", "cell-16", 6),
     Figure(("ready_surfaces.jpg",), "python tools/manual/contact_sheet.py {out}/ready_surfaces.png", 3),
     Figure(("removed_dust.png",), "python tools/manual/measured_skins.py {out}/removed_dust.png"),
