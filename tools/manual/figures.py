@@ -97,6 +97,7 @@ FIGURES = (
         3,
     ),
     notebook("patch_length.png", "02_brdf_and_grating_equation", "cell-16", 6),
+    Figure(("picture_error.png",), "python tools/manual/picture_error.py {out}/picture_error.png", 3),
     Figure(("ready_surfaces.jpg",), "python tools/manual/contact_sheet.py {out}/ready_surfaces.png", 3),
     Figure(("removed_dust.png",), "python tools/manual/measured_skins.py {out}/removed_dust.png"),
     notebook("scalar_theory.png", "05_can_i_trust_the_picture", "cell-07", 3),
