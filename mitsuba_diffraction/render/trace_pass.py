@@ -227,7 +227,7 @@ def trace_with_mitsubas_film(scene: mi.Scene, integrator: mi.Integrator, spp: in
 class LightOfBands:
     """Contributions of the paths from the light of one pass (`LightPaths.splats`), by band, in the order of tracing.
 
-    They are in temporary files if they are many.
+    They are in temporary files if they are many. What a `diffraction_path` prepares for a scene is kept for all passes.
     """
 
     def __init__(self, bands: tuple[Rows, ...]) -> None:
@@ -235,6 +235,15 @@ class LightOfBands:
         self._traced: tuple[int, int] | None = None
         self._columns = 0
         self._files: list[Any] = []
+        self._prepared: tuple[mi.Integrator, mi.SamplingIntegrator, LightPaths | None] | None = None
+
+    def parts(
+        self, integrator: Any, scene: mi.Scene, sensor: mi.Sensor
+    ) -> tuple[mi.SamplingIntegrator, LightPaths | None]:
+        """Return `parts` of a `diffraction_path` for a scene that does not change from pass to pass."""
+        if self._prepared is None or self._prepared[0] is not integrator:
+            self._prepared = integrator, *integrator.parts(scene, sensor)
+        return self._prepared[1:]
 
     def of(self, rows: Rows, light: LightPaths, spp: int, seed: int, margin: int) -> NDArray[np.float32]:
         """Return the contributions to some rows of a pass, and to `margin` rows above and below."""
@@ -282,7 +291,7 @@ def _trace(
     spp = sampler.sample_count()
     sums = None
     if hasattr(integrator, "parts"):
-        integrator, light = integrator.parts(scene, sensor)
+        integrator, light = light_of_bands.parts(integrator, scene, sensor)
         if light is not None:
             # What Dr.Jit keeps of the last pass is larger than the contributions, which are in other memory.
             dr.flush_malloc_cache()

@@ -10,6 +10,7 @@ import pytest
 from bsdf_support import bitmap, grating, uniform, use
 
 import mitsuba_diffraction  # noqa: F401 (settles which LLVM is used before a variant is set)
+from mitsuba_diffraction.integrator.paths import LightPaths
 from mitsuba_diffraction.render import scene as scene_module
 from mitsuba_diffraction.render.scene_file import SceneFile
 from mitsuba_diffraction.render.spectral_film import channel_weights
@@ -272,6 +273,38 @@ def test_light_paths_begin_where_gratings_are_lit(llvm):
     assert dr.all(dr.any(power != 0) | ~starts)
 
 
+def beam_on_a_grating():
+    """All light in the room is cast by the plate."""
+    beam = mi.ScalarTransform4f().look_at([0, -2.3, 3.5], [0, 0, 0.4], [0, 1, 0])
+    spot = {"type": "spot", "intensity": uniform(8.0), "cutoff_angle": 11, "to_world": beam}
+    return scene(plate=plate(blaze(material="Al"), height=0.4), spot=spot)
+
+
+def small_grating_in_the_sun():
+    return scene(plate=plate(blaze(material="Al"), 0.05, height=0.4), sun=SUN)
+
+
+@pytest.mark.parametrize(("build", "number"), [(beam_on_a_grating, 1 / 2), (small_grating_in_the_sun, 1 / 64)])
+def test_light_paths_are_as_many_as_their_light_in_the_picture_requires(build, number, llvm):
+    built = build()
+    integrator = mi.load_dict({"type": "diffraction_path", "max_depth": 3})
+    found = [integrator.parts(built, built.sensors()[0])[1] for _ in range(2)]
+    assert [light.per_sample for light in found] == [number, number]
+    assert found[0].count(64) == 64 * 64 * number
+
+
+@pytest.mark.slow
+def test_few_light_paths_have_the_expectation_of_many(llvm, monkeypatch):
+    built = sun_alone()
+    integrator = mi.load_dict({"type": "diffraction_path", "max_depth": 3})
+    monkeypatch.setattr(LightPaths, "_number_per_sample", lambda self: 1 / 64)
+    few, error = region_means(built, integrator, 4096)
+    monkeypatch.setattr(LightPaths, "_number_per_sample", lambda self: 1 / 2)
+    many, its_error = region_means(built, integrator, 512)
+    np.testing.assert_array_less(np.abs(few - many), 4 * np.hypot(error, its_error))
+    assert (error < 0.02 * many.max()).all()
+
+
 @pytest.mark.parametrize(("reflectance", "traces"), [(0.0, False), (0.1, True)])
 def test_light_paths_are_traced_only_if_a_surface_reflects_them(reflectance, traces, llvm):
     lamp = {**plate(diffuse(reflectance), height=2.0), "emitter": {"type": "area", "radiance": uniform(1.0)}}
@@ -384,6 +417,19 @@ SCENE = """<scene version="3.0.0">
             <string name="material" value="none"/></bsdf></shape>
     <emitter type="directional"><vector name="direction" x="0" y=".6" z="-.8"/></emitter>
 </scene>"""
+
+
+def test_any_number_of_light_paths_has_the_same_kernel(llvm, tmp_path):
+    (tmp_path / "scene.xml").write_text(SCENE)
+    built = SceneFile(tmp_path / "scene.xml").load()
+    _, light = built.integrator().parts(built, built.sensors()[0])
+    hashes = []
+    for count in (300, 700):
+        dr.kernel_history_clear()
+        with dr.scoped_set_flag(dr.JitFlag.KernelHistory, True):
+            assert list(light.splats(0, count))
+            hashes.append({kernel["hash"] for kernel in dr.kernel_history((dr.KernelType.JIT,))})
+    assert hashes[0] == hashes[1]
 
 
 @pytest.mark.slow

@@ -15,6 +15,7 @@ import pytest
 from PIL import Image
 
 import mitsuba_diffraction  # noqa: F401 (settles which LLVM is used before a variant is set)
+from mitsuba_diffraction.integrator.paths import LightPaths
 from mitsuba_diffraction.optics.color import spectrum_to_XYZ
 from mitsuba_diffraction.render import SpectralImage, passes, render
 from mitsuba_diffraction.render import trace_pass as tracing
@@ -114,6 +115,17 @@ def test_a_picture_in_bands_has_the_expectation_of_one_in_a_single_piece(integra
     error = np.sqrt((whole.var(0, ddof=1) + banded.var(0, ddof=1)) / 8)
     assert (error < 0.1 * whole.mean(0)).all()
     np.testing.assert_array_less(np.abs(banded.mean(0) - whole.mean(0)), 4 * error)
+
+
+def test_passes_prepare_the_light_once(llvm, monkeypatch):
+    built = SceneFile(write_scene("diffraction_path")).load()
+    bands, prepared = bands_of(built), []
+    original = LightPaths._number_per_sample
+    monkeypatch.setattr(LightPaths, "_number_per_sample", lambda self: prepared.append(self) or original(self))
+    light = LightOfBands(bands)
+    for seed in range(3):
+        trace_pass(built, 1, seed, None, bands[0], light)
+    assert len(prepared) == 1
 
 
 def test_light_of_bands_is_that_of_the_whole_bit_for_bit(three_bands):

