@@ -78,6 +78,13 @@ FIGURES = (
         needs="a Python with bpy as $BLENDER_PYTHON (tools/manual/cycles_picture.py)",
     ),
     Figure(("design.png",), "mitsuba-diffraction design precompute/designed/cat.png -o {out}/design.gsf"),
+    Figure(
+        ("word.jpg",),
+        """mitsuba-diffraction design precompute/designed/diffract.png -o {out}/word.gsf
+        mitsuba-diffraction render scenes/projection.xml -D plate={out}/word.toml -D room=1.5e-5 --exposure 10.8 \
+            --width 1280 --height 720 --spp 24 --denoise -o {out}/word.exr""",
+        10,
+    ),
     Figure(("eye_chart.png",), "python tools/manual/eye_chart.py {out}/eye_chart.png"),
     Figure(
         ("efficiencies.png",),
@@ -123,7 +130,7 @@ FIGURES = (
     Figure(
         ("viewer.png", "viewer_snake.png"),
         """python tools/manual/viewer_picture.py {out}/viewer.png --frames 3
-        python tools/manual/viewer_picture.py {out}/viewer_snake.png --surface xenopeltis --frames 3""",
+        python tools/manual/viewer_picture.py {out}/viewer_snake.png --surface xenopeltis --frames 10""",
         needs="Chromium (tools/manual/live_browser.py)",
     ),
 )
