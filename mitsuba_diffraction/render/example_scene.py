@@ -53,7 +53,7 @@ def example_scene(
             "sampler": {"type": "independent", "sample_count": spp},
             "film": {"type": "hdrfilm", "width": size, "height": size, "rfilter": {"type": "gaussian"}},
         },
-        "sky": {"type": "constant", "radiance": {"type": "d65", "scale": 0.003}},
+        "sky": {"type": "constant", "radiance": {"type": "d65", "scale": 0.0003}},
         "lamp": {"type": "point", "position": [0, 0, LAMP_HEIGHT], "intensity": {"type": "d65"}},
         "grating": {"type": "disk", "bsdf": {"type": "diffraction_grating", kind: surface, **parameters}},
     }
