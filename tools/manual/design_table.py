@@ -3,6 +3,7 @@
     python tools/manual/design_table.py           # all rows
     python tools/manual/design_table.py cat ring  # those whose names contain one of the words
     python tools/manual/design_table.py bound     # of other targets: what the lobes of the orders allow
+    python tools/manual/design_table.py colours   # ΔE00 of two coloured pictures, by plate
 
 Times are of the processor, on one core.
 """
@@ -12,6 +13,7 @@ from __future__ import annotations
 import sys
 import time
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -21,8 +23,10 @@ from numpy.typing import NDArray
 import mitsuba_diffraction as md
 from mitsuba_diffraction.files.picture_file import read_picture
 from mitsuba_diffraction.inverse_design.plate import Plate
-from mitsuba_diffraction.inverse_design.search import far_field_of
+from mitsuba_diffraction.inverse_design.result import Design
+from mitsuba_diffraction.inverse_design.search import WHITE, _Search, far_field_of
 from mitsuba_diffraction.inverse_design.target import wanted_fractions
+from mitsuba_diffraction.rigorous.solver import one_thread
 
 CAT = Path(__file__).parents[2] / "precompute" / "designed" / "cat.png"
 PLATES: dict[str, Mapping[str, float]] = {
@@ -96,11 +100,62 @@ def bound(name: str, target: NDArray[np.float64]) -> str:
     return f"| {name} | {100 * light:.0f} % | {np.corrcoef(found.ravel(), wanted.ravel())[0, 1]:.2f} |"
 
 
+def coloured() -> dict[str, NDArray[np.float64]]:
+    """Return two coloured pictures, linear sRGB (96, 96, 3), rows from the top."""
+    y, x = np.mgrid[1:-1:96j, -1:1:96j]
+    colours = {
+        "red": (255, 0, 0),
+        "blue": (0, 80, 255),
+        "orange": (255, 140, 30),
+        "dusk": (40, 60, 160),
+        "sun": (255, 230, 120),
+        "sea": (20, 40, 90),
+    }
+    linear = {}
+    for name, encoded in colours.items():
+        c = np.array(encoded) / 255
+        linear[name] = np.where(c <= 0.04045, c / 12.92, ((c + 0.055) / 1.055) ** 2.4)
+    shapes = np.zeros((96, 96, 3))
+    shapes[np.hypot(x + 0.45, y) < 0.38] = linear["red"]
+    shapes[(np.abs(x - 0.45) < 0.33) & (np.abs(y) < 0.33)] = linear["blue"]
+    height = (y[..., None] + 1) / 2
+    sunset = linear["orange"] * (1 - height) + linear["dusk"] * height
+    sunset[np.hypot(x, y + 0.15) < 0.3] = linear["sun"]
+    sunset[y < -0.35] = linear["sea"]
+    return {"red disc, blue square": shapes, "sunset": sunset}
+
+
+@one_thread()
+def of_own_reliefs(target: NDArray[np.float64], starts: int) -> Design:
+    """Return a design whose light of each wavelength is that of a relief for it alone; its relief is the last one."""
+    plate = Plate(0.8, 32, 0.8, 17.5, WHITE, None, None, 0.13)
+    wanted = wanted_fractions(target, plate)
+    predicted = []
+    for wavelength, part in zip(WHITE, wanted, strict=True):
+        own = replace(plate, wavelengths=np.array([wavelength]))
+        search = _Search(own, part[None], starts, lambda *_: None, lambda *_: None)
+        search(0)
+        found = Design.of(search.heights[:, ::-1], own, part[None, :, ::-1])
+        predicted.append(found.predicted[0])
+    return replace(Design.of(found.texels, plate, wanted[..., ::-1]), predicted=np.array(predicted))
+
+
 def main(words: Sequence[str]) -> None:
     """Print the rows whose names contain one of the words, or all."""
     if list(words) == ["bound"]:
         for name, target in targets().items():
             print(bound(name, target), flush=True)
+        return
+    if list(words) == ["colours"]:
+        plates: dict[str, Mapping[str, int | float]] = {
+            "default": {"starts": 6},
+            "3.2 µm deep": {"starts": 6, "height_range": 3.2},
+            "64 × 64 texels, 3.2 µm deep": {"starts": 2, "texels": 64, "height_range": 3.2},
+        }
+        for name, target in coloured().items():
+            differences = [f"{md.design(target, **plate).colour_difference:.1f}" for plate in plates.values()]
+            differences.append(f"{of_own_reliefs(target, 6).colour_difference:.1f}")
+            print(f"| {name} | {' | '.join(differences)} |", flush=True)
         return
     cat = read_picture(CAT)
     requests = [(f"cat, {name}", cat, options) for name, options in PLATES.items()]
