@@ -15,7 +15,7 @@ import numpy as np
 import typer
 from numpy.typing import NDArray
 
-from ..errors import RequestError
+from ..errors import RequestError, is_number
 from ..files.outputs import check_outputs, free_name
 from ..files.picture_file import read_picture
 from ..inverse_design import Design, Verdict, makers
@@ -102,6 +102,10 @@ def design(
     if not invert and _is_dark_on_light(picture):
         say("note", f"{target} is light up to its edges; --invert casts what is dark in it, with more contrast")
     wavelengths = None if wavelength is None else parse_numbers("--wavelength", wavelength).tolist()
+    # Before the number of texels is computed from them.
+    for option, value in (("--texel", texel), ("--angle", angle), ("--wavelength", np.min(wavelengths or WHITE))):
+        if not (is_number(value) and value > 0):
+            raise RequestError(f"{option}: got {value:g}, wanted a positive number")
     options = _OPTIONS | {"target": str(target)}
     strokes, longest, note = finest_strokes(picture), max(wavelengths or WHITE), ""
     index = None if int_ior is None else converted(int_ior)

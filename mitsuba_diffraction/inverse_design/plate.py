@@ -75,7 +75,8 @@ def depth_for_strokes(strokes: float, wavelengths: ArrayLike, int_ior: float | s
         return _HEIGHT_RANGE
     per_height = light / path
     depth = min(_FACET_SPREAD / 2 * strokes * float(per_height.mean()), _MAX_PATH * float(per_height.min()))
-    return max(_HEIGHT_RANGE, math.floor(10 * depth) / 10)
+    # Also of what is not a number, which is refused later.
+    return math.floor(10 * depth) / 10 if depth > _HEIGHT_RANGE else _HEIGHT_RANGE
 
 
 @dataclass(frozen=True, eq=False)

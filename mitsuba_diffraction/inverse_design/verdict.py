@@ -96,7 +96,7 @@ def _remedy(design: Design, strokes: float | None, inverted: bool) -> str:
     if design.inside.mean() > _MAX_LIT:
         option = "without --invert, its other parts are cast" if inverted else "--invert casts its dark parts instead"
         return f"most of the picture is light: {option}"
-    if strokes is not None and plate.levels is None:
+    if strokes is not None and plate.levels is None and plate.wavelengths.size > 1:
         deep = depth_for_strokes(strokes, plate.wavelengths, plate.int_ior)
         if plate.height_range < _SHALLOW * deep:
             return f"facets are too short for its strokes in light of many wavelengths: --height-range {deep:.2g}"

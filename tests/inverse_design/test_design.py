@@ -346,6 +346,16 @@ def test_of_a_negative_the_option_that_was_given_is_no_remedy():
     assert remedy == "most of the picture is light: without --invert, its other parts are cast"
 
 
+def test_depth_is_no_remedy_in_light_of_one_wavelength():
+    picture = np.zeros((8, 8))
+    picture[:2, :2] = 1
+    heights = 0.5 * np.random.default_rng(0).random((12, 12))
+    for wavelengths, is_remedy in (([532.0], False), ([430.0, 670.0], True)):
+        plate = Plate(1.0, 12, 0.5, 17.5, np.array(wavelengths), None, None, 0.1)
+        found = Design.of(heights, plate, wanted_fractions(picture, plate))
+        assert ("--height-range" in Verdict.of(found, 4.0).remedy) == is_remedy
+
+
 @pytest.mark.parametrize("options", [{"levels": 4, "height_range": 0.2}, {"levels": 3, "height_range": 0.18}])
 def test_the_remedy_of_few_levels_works(options):
     found = md.design(lopsided(), wavelengths=532, texel=1.0, texels=16, starts=3, **options)

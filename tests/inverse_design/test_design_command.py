@@ -190,6 +190,11 @@ def test_an_interrupted_command_writes_the_best_so_far(command, monkeypatch, num
         ("flag.png --height-range 800", "error: --height-range: got 800 µm"),
         ("flag.png --int-ior glass", "error: --int-ior: got 'glass', wanted"),
         ("flag.png --detail 1", "error: --detail: got 1.0, wanted the number of finest strokes"),
+        ("flag.png --detail nan", "error: --detail: got nan, wanted the number of finest strokes"),
+        ("flag.png --wavelength 500,nan", "error: --wavelength: got nan, wanted a positive number"),
+        ("flag.png --wavelength 0", "error: --wavelength: got 0, wanted a positive number"),
+        ("flag.png --angle 0", "error: --angle: got 0, wanted a positive number"),
+        ("flag.png --texel 0", "error: --texel: got 0, wanted a positive number"),
         ("dot.png --texels 32", "error: dot.png: it is the mirror direction only"),
     ],
 )
