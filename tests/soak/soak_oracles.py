@@ -329,7 +329,9 @@ def of_orders(case: Case):
                 note=dict(order=order, wavelength=case.wavelengths[channel], centre=grid[start:end].mean(0)),
             )
             power = case.powers(wi, grid[start:end], value[start:end] * area[start:end, None])
-            total[k, channel] += power[:, channel].sum()
+            # Sets of wide lobes overlap next to the horizon: each of them has its part of a point.
+            sharing = sum(other[3](grid[start:end]) for other in those if other[1] == channel)
+            total[k, channel] += (power[:, channel] / np.maximum(sharing, 1)).sum()
         total[k] += mirror_reflectance(case, wi)
     if every == 1 and c.conserves_energy and c.base is None:
         bound(case, total)
