@@ -570,7 +570,8 @@ def update_is_a_fresh_scene(case: Case):
         is_recipe = c.surface.by_name and c.transmission != "none"  # for the light inside of the first index
         if abs(lower - c.outside) > 0.03 and (lower > c.outside) == (c.material > c.outside) and not is_recipe:
             changes["material"] = lower
-            values["eta"] = c.material / relative
+            # Rounded as in a scene: at the horizon of the lower medium T follows the last bit.
+            values["eta"] = float(np.float32(c.material)) / float(np.float32(relative))
     if c.films and "thin_film_thickness.data" not in values:
         changes["films"] = tuple((n, factor * thickness) for n, thickness in c.films)
         values["thin_film_thickness"] = [thickness for _, thickness in c.films]
