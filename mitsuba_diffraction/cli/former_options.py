@@ -53,7 +53,7 @@ def take_options(command: Any, arguments: Sequence[str]) -> tuple[list[str], Giv
         elif option == "--plane":
             given.insert(0, (word, key, "level_plane"))
         elif key in FLAGS:
-            given.append((word, key, "true"))
+            given.append((word, key, value or "true"))
         else:
             value = value if equals else next(words, "")
             if not value:

@@ -120,7 +120,7 @@ class OrderEfficiencies:
             stream.write(f"# {MARK}\n")
 
     def plot(self, path: str | os.PathLike[str] | None = None) -> Figure:
-        """Plot the strongest orders: lines over the wavelength or the angle, or of many of both a map for each order.
+        """Plot the strongest orders: lines over wavelength or angle; where both are many, a map for each order.
 
         Returns the figure, and writes it as PNG, PDF or SVG if a path is given.
         """

@@ -111,6 +111,11 @@ def test_help_shows_no_option_of_a_surface(command):
         assert (code, [option for option in FORMER.keys() - own if option in out]) == (0, [])
 
 
+def test_a_flag_of_version_0_3_may_be_false(command, computed):
+    assert command(f"precompute {SCAN} --fill-missing=false")[0] == 0
+    assert computed[0].surface["fill_missing"] is False
+
+
 def test_several_options_are_one_line(command, computed):
     code, _, error = command("precompute blazed --extent tile --coherence-length=20 --largest-angle 60")
     new = "blazed,extent=tile,coherence_length=20,largest_angle=60"

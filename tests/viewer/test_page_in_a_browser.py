@@ -564,7 +564,6 @@ def test_the_first_frame_has_no_visible_noise(disc, opened):
     assert steps[0] < 1.5 * steps[1] + 1
 
 
-@pytest.mark.slow
 def shown_at(tab, point, back, distance):
     """The largest channel of what is shown where a point is seen by a camera towards `back`, 0 to 255."""
     right = np.cross([0, 0, 1], back) / np.hypot(back[0], back[1])
@@ -586,6 +585,7 @@ def shown_at(tab, point, back, distance):
     )
 
 
+@pytest.mark.slow
 def test_a_sphere_casts_a_shadow_on_the_ground_and_mirrors_the_lamp(opened):
     tab = opened(Surface.named("blazed", {"depth": 0.1, "samples": 64, "coherence_length": 3.0, "material": "Al"}))
     elevation, distance = np.radians(40), 8
@@ -611,6 +611,7 @@ def test_a_sphere_casts_a_shadow_on_the_ground_and_mirrors_the_lamp(opened):
     assert shown_at(tab, normal, back, distance) > 240
 
 
+@pytest.mark.slow
 def test_a_disc_has_a_hole_and_clear_rings(disc, opened):
     tab = opened(disc)
     assert tab.evaluate("[viewer.state.shape, viewer.state.material, viewer.state.coat]") == ["disc", "Al", 1.55]

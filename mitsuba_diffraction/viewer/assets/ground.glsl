@@ -19,10 +19,10 @@ float footprintAt(vec2 p) {
   ivec2 low = ivec2(floor(at));
   float sum = 0.0;
   for (int k = 0; k < 4; k++) {
-    ivec2 step = ivec2(k & 1, k >> 1), cell = low + step;
-    if (any(lessThan(cell, ivec2(0))) || any(greaterThanEqual(cell, size))) continue;
+    ivec2 step = ivec2(k & 1, k >> 1), texel = low + step;
+    if (any(lessThan(texel, ivec2(0))) || any(greaterThanEqual(texel, size))) continue;
     vec2 weight = mix(1.0 - part, part, vec2(step));
-    sum += weight.x * weight.y * texelFetch(uFootprint, cell, 0).x;
+    sum += weight.x * weight.y * texelFetch(uFootprint, texel, 0).x;
   }
   return sum;
 }
