@@ -185,17 +185,19 @@ class Surface:
         known = tuple(name for name in Recipe.of_source(str(path)).known if name not in _OF_SCENE)
         own = {name: values.pop(name) for name in known if name in values}
         recipe, command = Recipe.of_source(str(path), own), ""
+        is_recipe = path.suffix.lower() == ".toml"
+        # A recipe of the package has its name in scenes and commands, wherever they are.
+        of_package = is_recipe and path.resolve().parent == (examples_folder() / "precompute").resolve()
+        name = path.stem if of_package else path.name
         grating: dict[str, Any]
         if str(path) in PROFILES and own.keys() <= set(parameters_of_profile(str(path))):
             grating = {"profile": str(path), **own}
-        elif path.suffix.lower() == ".toml" and not own:
-            # A recipe of the package has its name in a scene, wherever the scene lies.
-            of_package = path.resolve().parent == (examples_folder() / "precompute").resolve()
-            grating = {"filename": path.stem if of_package else path.name}
+        elif is_recipe and not own:
+            grating = {"filename": name}
         else:
             grating = {"filename": f"{path.stem}.exr"}
-            extent = {} if path.suffix.lower() == ".toml" else {"extent": recipe.settings.extent}
-            surface = written(path.name, own | extent)
+            extent = {} if is_recipe else {"extent": recipe.settings.extent}
+            surface = written(name, own | extent)
             command = shell_command(NAME, "precompute", surface, "-o", f"{path.stem}.exr")
         return cls.of_recipe(recipe, path.stem, grating, values, progress, command, known)
 

@@ -12,6 +12,7 @@ import numpy as np
 import pytest
 
 import mitsuba_diffraction as md
+from mitsuba_diffraction.errors import shell_command
 from mitsuba_diffraction.optics.color import daylight, matching_functions
 from mitsuba_diffraction.precomputation.recipe import Recipe
 from mitsuba_diffraction.spectrum.tables import SliceTable
@@ -54,8 +55,11 @@ def test_a_page_of_a_film_says_that_it_shows_reflected_light(command, tmp_path, 
     assert "film: the page shows the light that it reflects" in error
 
 
-def test_a_recipe_of_the_package_has_its_name_in_the_saved_scene():
+def test_a_recipe_of_the_package_has_its_name_in_the_saved_scene_and_in_its_command():
     assert Surface.named("elaphe_afm", {}).grating == {"filename": "elaphe_afm"}
+    changed = Surface.named("blaze", {"tolerance": 0.05, "coherence_length": 3.0})
+    surface = "blaze,coherence_length=3.0,tolerance=0.05"
+    assert changed.command == shell_command("mitsuba-diffraction", "precompute", surface, "-o", "blaze.exr")
 
 
 @pytest.mark.slow
