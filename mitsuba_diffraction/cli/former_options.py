@@ -16,7 +16,8 @@ from ..settings import SPECTRUM_PARAMETERS
 from ..surface.gratings import PROFILES
 from .arguments import SURFACE
 
-FORMER = {f"--{key.replace('_', '-')}": key for key in (*SCAN_KEYS, *SPECTRUM_PARAMETERS)} | {"--plane": "prepare"}
+_KEYS = [key for key in (*SCAN_KEYS, *SPECTRUM_PARAMETERS) if key != "wavelengths"]  # which never was an option
+FORMER = {f"--{key.replace('_', '-')}": key for key in _KEYS} | {"--plane": "prepare"}
 """Option → name of its value in a recipe."""
 
 _LASTING = {

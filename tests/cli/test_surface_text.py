@@ -26,7 +26,6 @@ OPTIONS = {
     "--plane": (SCAN, ""),
     "--theory": ("lamellar,depth=0.1", "rigorous"),
     "--coherence-length": (SCAN, "12"),
-    "--wavelengths": (f"{SCAN},wavelengths=400", "700"),
     "--tolerance": (SCAN, "2e-2"),
     "--largest-height-range": (SCAN, "30"),
     "--extent": ("scan.npy,pixel_size=0.5", "sample"),
@@ -81,7 +80,7 @@ def test_an_option_of_version_0_3_gives_the_recipe_of_the_new_form(option, comma
         )
         assert [part.partition("note: ")[2] for part in error.splitlines()] == wanted
     assert computed[0] == computed[1] == computed[2]
-    assert computed[0] != Recipe.of_source(*parsed(surface.removesuffix(",wavelengths=400")), "tile")
+    assert computed[0] != Recipe.of_source(*parsed(surface), "tile")
 
 
 @pytest.mark.parametrize("name", sorted(COMMANDS))
@@ -114,6 +113,12 @@ def test_help_shows_no_option_of_a_surface(command):
 def test_a_flag_of_version_0_3_may_be_false(command, computed):
     assert command(f"precompute {SCAN} --fill-missing=false")[0] == 0
     assert computed[0].surface["fill_missing"] is False
+
+
+def test_an_option_that_never_was_one_is_corrected(command):
+    code, _, error = command("efficiency blazed --wavelengths 500")
+    assert code == 2
+    assert "No such option: --wavelengths" in error
 
 
 def test_several_options_are_one_line(command, computed):
