@@ -773,6 +773,11 @@ def derivatives_are_differences(case: Case):
         return
     # On the slope of the lobe of an order.
     sun = wo[c.derived % len(wo)] + 0.7 * wavelength * 1e-3 * case.model.sigma_q * np.array([0.6, 0.8, 0])
+    # An order whose exact direction, from either side, crosses the horizon appears at once: no derivative has that.
+    index = case.model.indices(np.array([wi[2] >= 0, sun[2] >= 0]), wavelength * 1e-3)[0]
+    half_width = 4 * wavelength * 1e-3 * case.model.sigma_q / index
+    if (np.hypot(*np.transpose([wi, sun])[:2]) / np.linalg.norm([wi, sun], axis=1) + half_width > 1).any():
+        return
     film = {"type": "specfilm", "width": 4, "height": 4, "rfilter": {"type": "box"}, "component_format": "float32"}
     low, high = max(wavelength - 30, VISIBLE[0]), min(wavelength + 30, VISIBLE[1])
     film["band"] = {"type": "regular", "wavelength_min": low, "wavelength_max": high, "values": "1, 1"}
