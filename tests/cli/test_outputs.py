@@ -116,6 +116,7 @@ def test_a_scene_names_files(folder):
         ("validate scan.toml --json scan.toml", "scan.toml"),
         ("validate scan.toml --markdown scan.png", "scan.png"),
         ("benchmark scan.png,pixel_size=0.05,height_range=0.3 --plot scan.png", "scan.png"),
+        ("benchmark scan.toml --plot scan.png", "scan.png"),
     ],
 )
 def test_inputs_are_not_overwritten(command, line, name):

@@ -47,7 +47,8 @@ def benchmark(
         check_suffix("--plot", plot, ".png")
     writes = [(option, path) for option, path in (("--json", json), ("--plot", plot)) if path is not None]
     source, values = ("", {}) if scan is None else parsed(scan)
-    outputs.check_outputs([Path(source)] if source else [], writes, overwrite=overwrite)
+    recipe = Recipe.of_source(source, values) if source else None
+    outputs.check_outputs([Path(source), *recipe.files] if recipe else [], writes, overwrite=overwrite)
     if terms and (scan is not None or surface or tolerance):
         raise RequestError("--terms: got other surfaces or tolerances, too; it has tiles of its own")
     if pictures and (scan is not None or surface or tolerance or terms or plot is not None):
@@ -57,8 +58,7 @@ def benchmark(
     if unknown := set(surface or []) - set(names):
         raise RequestError(f"--surface: got {', '.join(sorted(unknown))}, wanted among {', '.join(names)}")
     cases = [case for case in cases if not surface or case.name in surface]
-    if scan is not None:
-        recipe = Recipe.of_source(source, values)
+    if recipe is not None:
         if "scan" not in recipe.surface:
             raise RequestError(f"{source}: got no scan; --surface takes the built-in surfaces")
         cases.append(scan_case(recipe.height_field()))
