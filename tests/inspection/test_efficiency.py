@@ -252,6 +252,16 @@ def test_a_wrong_command_is_one_line(command, line, message):
     assert error.count("\n") == 1
 
 
+def test_a_recipe_of_a_grating_below_a_coat_is_refused_as_orders_are_in_air(command, tmp_path):
+    recipe = tmp_path / "coat.toml"
+    spectrum = 'theory = "rigorous"\nmaterial = "Al"\next_ior = 1.5\n'
+    recipe.write_text(f'[surface]\nprofile = "sinusoidal"\nperiod = 0.7\ndepth = 0.1\n[spectrum]\n{spectrum}')
+    for line in ("efficiency SURFACE", f"export SURFACE -o {tmp_path}/orders.csv --angle 0"):
+        code, said, error = command(line.replace("SURFACE", str(recipe)))
+        assert (code, said) == (2, "")
+        assert "ext_ior: got 1.5 of the recipe, wanted none: these orders are in air" in error
+
+
 def test_the_command_takes_theory_and_material_of_a_recipe(command):
     recipe = Path(__file__).parents[2] / "precompute" / "rigorous" / "foil_one_direction.toml"
     code, said, error = command("efficiency", str(recipe), "--wavelength", "600")
