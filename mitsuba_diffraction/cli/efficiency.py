@@ -49,7 +49,9 @@ def efficiency(
     angles, wavelengths = angles_of("--angle", angle), parse_numbers("--wavelength", wavelength)
     name, values = parsed(surface)
     given = {key: values.pop(key) for key in _OF_LIGHT if key in values}
-    recipe = recipe_of(name, values)
+    # The names of rigorous theory are known to its recipes alone.
+    of_theory = {"theory": "rigorous"} if given.get("theory") == "rigorous" else {}
+    recipe = recipe_of(name, values | of_theory)
     settings = ScalarSettings() if recipe is None else recipe.settings
     chosen = {"theory": "scalar", "transmission": "none", **settings.chosen}
     theory, transmission = (given.get(key, chosen[key]) for key in _OF_LIGHT[:2])

@@ -344,7 +344,7 @@ class LightPaths:
         splats = [*self.splats(_PILOT_SEED, _PILOT_PATHS), np.zeros((1, 2 + 2 * dr.size_v(mi.Spectrum)), np.float32)]
         # Of a path for each sample.
         values = np.concatenate(splats)[:, -dr.size_v(mi.Spectrum) :].mean(axis=1) * (_PILOT_PATHS / self.pixels)
-        radiance = float(np.median(self._direct_light())) + values.sum() / _PILOT_PATHS
+        radiance = float(np.nanmedian(self._direct_light())) + values.sum() / _PILOT_PATHS
         variance = np.square(values / (radiance or 1)).sum() / _PILOT_PATHS
         exponent = 0.5 * math.log2(variance) if variance > 0 else -math.inf
         return 2.0 ** round(min(max(exponent, _MIN_LIGHT_PATHS), _MAX_LIGHT_PATHS))
