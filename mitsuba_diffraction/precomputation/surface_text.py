@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from contextlib import suppress
 from pathlib import Path
 from typing import Any
@@ -21,7 +21,7 @@ _LISTS = ("pixel_size", "unit", "wavelengths", "prepare")
 def parsed(text: str) -> tuple[str, dict[str, Any]]:
     """Return source, as `source_named`, and values; numbers, booleans, steps and repeated names as in a recipe.
 
-    The source is the longest beginning that is a file, as names of files may have commas.
+    The source is the longest beginning that is a file, as names of files may have commas; so is a value.
 
     Raises:
         RequestError: if a part is not name=value, a name is repeated that has no list, or there is no such surface.
@@ -30,7 +30,7 @@ def parsed(text: str) -> tuple[str, dict[str, Any]]:
     ends = range(len(parts), 1, -1)
     end = next((end for end in ends if os.path.exists(",".join(parts[:end]))), 1)
     source, values = ",".join(parts[:end]), dict[str, Any]()
-    for name, equals, value in (item.strip().partition("=") for item in parts[end:]):
+    for name, equals, value in (item.strip().partition("=") for item in _items(parts[end:])):
         if not (name and equals and value) or (name in values and name not in _LISTS):
             got = f"{text}: got {name + equals + value!r}"
             raise RequestError(f"{got}, wanted name=value, each name once{_no_lists(name)}")
@@ -40,6 +40,15 @@ def parsed(text: str) -> tuple[str, dict[str, Any]]:
         say("note", f"{source} is the measured skin; {RENAMED[source]} is a synthetic one")
     single = {name: values[name][0] for name in _LISTS[:-1] if len(values.get(name, ())) == 1}
     return source_named(source), values | single
+
+
+def _items(parts: list[str]) -> Iterator[str]:
+    """Yield the parts; a value is continued by the following parts as long as it is the name of a file."""
+    while parts:
+        value = parts[0].partition("=")[2]
+        count = next((n for n in range(len(parts), 1, -1) if os.path.isfile(",".join([value, *parts[1:n]]))), 1)
+        yield ",".join(parts[:count])
+        parts = parts[count:]
 
 
 def _no_lists(name: str) -> str:

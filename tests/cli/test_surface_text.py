@@ -168,6 +168,9 @@ def test_a_file_may_have_commas_and_equals_signs_in_its_name(name, folder):
     for path in (name, str(folder / name)):
         assert parsed(path) == (path, {})
         assert parsed(f"{path},pixel_size=0.5") == (path, {"pixel_size": 0.5})
+        values = {"material": str(folder / name), "depth": 0.2}
+        assert parsed(f"blazed,material={path},depth=0.2") == ("blazed", values)
+        assert parsed(written("blazed", values)) == ("blazed", values)
 
 
 @pytest.mark.parametrize(
