@@ -252,7 +252,9 @@ def test_an_orientation_is_read_from_a_picture(suffix, value, tmp_path):
 
 def test_the_file_of_an_orientation_is_checked(tmp_path):
     (tmp_path / "text.png").write_text("text")
-    for name in ("missing.png", "radiall", str(tmp_path / "text.png")):
+    with pytest.raises((RuntimeError, ValueError), match=r"orientation: missing\.png: no such file"):
+        mi.load_dict(corner(orientation="missing.png"))
+    for name in ("radiall", str(tmp_path / "text.png")):
         with pytest.raises(
             (RuntimeError, ValueError), match=r"orientation: got .*, wanted radial, tangential, a number"
         ):

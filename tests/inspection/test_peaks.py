@@ -114,7 +114,7 @@ def test_the_command_answers_for_scan_recipe_and_spectrum(command, scan, sinusoi
     ("line", "message"),
     [
         ("saved.exr,pixel_size=1", "saved.exr: got pixel_size with a saved spectrum, wanted the recipe or the scan"),
-        ("scan.toml,theory=rigorous", "scan.toml: got theory rigorous, transmission none of an irregular surface"),
+        ("scan.toml,theory=rigorous", "theory: got rigorous with extent 'sample', wanted none"),
         ("scan.npy,pixel_size=1 --wavelength 300", "wavelengths: got 300, wanted nm from 360 to 830"),
         ("scan.npy,pixel_size=1,material=Alu", "material: got 'Alu'"),
         ("scan.npy,pixel_size=1 --angle 90", "--angle: got 90, wanted degrees above −90 and below 90"),
