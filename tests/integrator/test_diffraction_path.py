@@ -11,7 +11,7 @@ from bsdf_support import bitmap, grating, uniform, use
 
 import mitsuba_diffraction  # noqa: F401 (settles which LLVM is used before a variant is set)
 from mitsuba_diffraction.integrator.paths import LightPaths
-from mitsuba_diffraction.render import scene as scene_module
+from mitsuba_diffraction.render import scene_file
 from mitsuba_diffraction.render.scene_file import SceneFile
 from mitsuba_diffraction.render.spectral_film import channel_weights
 from mitsuba_diffraction.render.trace_pass import trace_pass
@@ -504,7 +504,7 @@ def test_both_halves_draw_the_lines_of_a_lamp(llvm, tmp_path, monkeypatch):
 
     found = np.array(list(pictures()))
     # Drawn by the response of the film alone they have the same mean and far more noise.
-    monkeypatch.setattr(scene_module, "draw_wavelengths_of_lights", lambda built: None)
+    monkeypatch.setattr(scene_file, "draw_wavelengths_of_lights", lambda built: None)
     wanted = np.array(list(pictures()))
     error = np.std(wanted, 0, ddof=1) / np.sqrt(len(wanted))
     np.testing.assert_array_less(np.abs(found.mean(0) - wanted.mean(0)), 4 * error)
