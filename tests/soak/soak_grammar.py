@@ -411,7 +411,8 @@ def configurations(draw):
         # Deeper ones take a minute to load.
         surface = replace(surface, depth=min(surface.depth, 0.3), count=1)
     if transmission != "none":
-        outside = draw(st.one_of(st.just(1.0), _rounded(1.0, 1.6)))
+        # Not 1.001: indices that differ by 1e-3 or less are taken as equal, and rounding decides which it is.
+        outside = draw(st.one_of(st.just(1.0), _rounded(1.002, 1.6)))
         material = draw(st.one_of(st.just(1.5), index).filter(lambda n: abs(n - outside) > 0.03))
         if draw(st.sampled_from([False, False, False, True])):
             material = draw(media(outside + 0.03))
@@ -423,7 +424,7 @@ def configurations(draw):
         coat = draw(st.one_of(st.none(), st.just(1.5), _rounded(1.05, 2.4), media(1.05)))
         outside = 1.0
         if coat is not None or not isinstance(material, str):
-            outside = draw(st.one_of(st.just(1.0), _rounded(1.0, 1.4)))
+            outside = draw(st.one_of(st.just(1.0), _rounded(1.002, 1.4)))
             outside = min(outside, coat_index(coat) - 0.04) if coat else outside
         base = draw(st.one_of(st.none(), _rounded(0.0, 1.0))) if not isinstance(material, str) else None
     films, film_scale = (), 1.0
