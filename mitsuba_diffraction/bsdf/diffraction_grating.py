@@ -22,7 +22,7 @@ PARAMETERS = (
     Parameter(
         "filename",
         "string",
-        "a spectrum file (`.exr`), or a recipe (`.toml`) whose spectrum is computed once and "
+        "a spectrum file (`.exr`), a recipe (`.toml`), whose spectrum is computed once and "
         "[cached](commands.md#caches-and-damaged-files), or the [name](commands.md#names-of-surfaces) of a profile or "
         "recipe of the package",
     ),
@@ -51,8 +51,7 @@ PARAMETERS = (
         "terms",
         "integer or string",
         "number of terms of a series, or `auto` (default): as many as the tolerance needs. An error above the "
-        "tolerance is logged; an error of all light or more is refused, unless `tolerance`, then also above 1, allows "
-        "it",
+        "tolerance is logged; an error of 1 or more is refused, unless `tolerance`, then also above 1, allows it",
     ),
     Parameter(
         "heights_from",
@@ -63,7 +62,7 @@ PARAMETERS = (
         "theory",
         "string",
         "theory used for a `profile`: `scalar`, or `rigorous`, Maxwell's equations for line gratings in the given "
-        "material; files and spectra specify their own. Rigorous theory has no scales, films, shadowing and base",
+        "material; files and spectra specify their own",
         "scalar",
     ),
     Parameter(
@@ -113,8 +112,8 @@ PARAMETERS = (
     Parameter(
         "lateral_scale",
         "float, texture or string",
-        "scales the lengths along the surface by s: orders of a period T lie at m/(sT), and the width of lobes is "
-        "unchanged; for orders that do not overlap",
+        "scales the lengths along the surface by s: orders of a period T lie at m/(sT), lobes keep their width; for "
+        "orders that do not overlap",
         "1",
     ),
     Parameter("shadowing", "string", "shadowing and masking, G: `v_cavity` or `none`", "v_cavity"),
