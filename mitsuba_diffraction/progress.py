@@ -35,6 +35,7 @@ err = Console(stderr=True, highlight=False, soft_wrap=True)
 
 MIN_REPORTED_SECONDS = 2.0  # of work before a log or a notebook shows progress
 _MIN_REPORTED_DURATION = 10.0  # s, of a command
+MIN_ANNOUNCED_SECONDS = 15.0  # that remain, for a line to say how many
 _UNITS_OF_BYTES = ("GB", 1e9), ("MB", 1e6), ("kB", 1e3)
 _IN_ASCII = {"−": "-", "–": "-", "→": "->", "≤": "<=", "≥": ">=", "±": "+-", "×": "x", "·": "*"}
 _IN_ASCII |= {"µ": "u", "°": " deg", "²": "^2", "…": "...", "∫": "integral of "}
@@ -161,25 +162,61 @@ def bytes_text(count: float) -> str:
     return f"{count / scale:.{0 if count >= 10 * scale else 1}f} {unit}"
 
 
+def takes_long(seconds: float) -> bool:
+    """Return whether a message says how long work takes that takes so long."""
+    return seconds >= MIN_ANNOUNCED_SECONDS
+
+
+def time_text(seconds: float) -> str:
+    """Format a time that is known roughly, such as 40 s, 3 min or 2.5 h."""
+    if seconds < 90:
+        return f"{seconds:.0f} s"
+    return f"{seconds / 60:.0f} min" if seconds < 5400 else f"{seconds / 3600:.1f} h"
+
+
 def _count(done: float, total: int, unit: str) -> str:
     """Format the part done."""
     return f"{done} {unit}" if unit.startswith("%") else f"{done:.10g} of {total} {unit}".rstrip()
 
 
+def _time_left() -> Callable[[float, float], str]:
+    """Return a function of the part done and the total that says how long the rest takes; "" while it is not known.
+
+    The rate is that since the first part: work that is resumed does not begin at zero, and kernels are compiled once.
+    """
+    first: tuple[float, float] | None = None
+
+    def text(done: float, total: float) -> str:
+        nonlocal first
+        now = time.monotonic()
+        first = first or ((now, done) if done else None)
+        begin, before = first or (now, done)
+        if now - begin < MIN_REPORTED_SECONDS or not before < done < total:
+            return ""
+        left = (now - begin) / (done - before) * (total - done)
+        return f", about {time_text(left)} left" if takes_long(left) else ""
+
+    return text
+
+
 def log_lines(
     label: str, unit: str = "", begin: str = "", seconds: float = 30.0, first: float = MIN_REPORTED_SECONDS
 ) -> Callable[..., None]:
-    """Report progress without a terminal: the message `begin`, a line after `first` seconds, then every `seconds`."""
+    """Report progress without a terminal: the message `begin`, a line after `first` seconds, then every `seconds`.
+
+    One more as soon as it is known how long the rest takes.
+    """
     if begin:
         say(label, begin)
-    start, depth = time.monotonic(), len(_stages)
-    due = start + first
+    start, depth, left = time.monotonic(), len(_stages), _time_left()
+    due, estimated = start + first, False
 
     def show(done: int, total: int, error: float = math.nan) -> None:
-        nonlocal due
-        if (now := time.monotonic()) >= due:
-            due = now + seconds
-            say(label, f"{_count(done, total, _after(unit, depth))}, {now - start:.0f} s")
+        nonlocal due, estimated
+        now, rest = time.monotonic(), left(done, total)
+        if now >= due or (rest and not estimated):
+            due, estimated = now + seconds, estimated or rest != ""
+            say(label, f"{_count(done, total, _after(unit, depth))}, {now - start:.0f} s{rest}")
 
     return show
 
@@ -271,12 +308,13 @@ def _notebook_line(label: str, unit: str) -> Iterator[Callable[..., None]]:
     """Display a line in the cell's output that shows progress and, at the end, the time."""
     from IPython.display import display
 
-    start, depth, handle = time.monotonic(), len(_stages), None
+    start, depth, left, handle = time.monotonic(), len(_stages), _time_left(), None
 
     def show(done: int, total: int, error: float = math.nan) -> None:
         nonlocal handle
         seconds = time.monotonic() - start
-        line = {"text/plain": f"{label}: {_count(done, total, _after(unit, depth))}, {seconds:.0f} s"}
+        shown = f"{_count(done, total, _after(unit, depth))}, {seconds:.0f} s{left(done, total)}"
+        line = {"text/plain": f"{label}: {shown}"}
         if handle is not None:
             handle.update(line, raw=True)
         elif seconds >= MIN_REPORTED_SECONDS:

@@ -157,11 +157,12 @@ def panel():
 @pytest.fixture
 def command(monkeypatch, capfd):
     """command(line) or command(*words): (exit code, stdout, stderr) of the command, in this process."""
+    # On a slow machine a command says how far it is, and how long it takes.
+    monkeypatch.setattr(progress, "MIN_ANNOUNCED_SECONDS", 1e6)
 
     def call(*words):
         arguments = shlex.split(words[0]) if len(words) == 1 else words
         monkeypatch.setattr(sys, "argv", [cli.NAME, *arguments])
-        # On a slow machine a command says how far it is.
         monkeypatch.setattr(progress, "log_lines", lambda *label: lambda *done: None)
         monkeypatch.setattr(progress, "MIN_REPORTED_SECONDS", 1e6)
         # Warnings are shown, as they are to a person, and what shows them is put back afterwards.

@@ -5,6 +5,7 @@ import io
 import math
 import re
 import time
+from types import SimpleNamespace
 
 import mitsuba as mi
 import nbformat
@@ -68,6 +69,26 @@ def test_a_log_says_what_is_done_before_anything_can_be_counted(capsys, monkeypa
     with progress.progress_bar("skin.toml", "%"), progress.stage("reading"):
         time.sleep(0.5)
     assert capsys.readouterr().err == "mitsuba-diffraction: skin.toml: reading\n"
+
+
+def test_a_log_says_early_how_long_the_rest_takes(capsys, monkeypatch):
+    """Work that is resumed at 40 % after 20 s, and does 1 % a second: 60 s are left, not 30."""
+    now = [0.0]
+    monkeypatch.setattr(progress, "time", SimpleNamespace(monotonic=lambda: now[0]))
+    show = progress.log_lines("spectrum", "%")
+    for done in range(40, 101):
+        now[0] = 20.0 + done - 40
+        show(done, 100)
+    assert capsys.readouterr().err.splitlines() == [
+        "mitsuba-diffraction: spectrum: 40 %, 20 s",
+        "mitsuba-diffraction: spectrum: 42 %, 22 s, about 58 s left",
+        "mitsuba-diffraction: spectrum: 72 %, 52 s, about 28 s left",
+    ]
+
+
+@pytest.mark.parametrize(("seconds", "text"), [(0.2, "0 s"), (89, "89 s"), (150, "2 min"), (9000, "2.5 h")])
+def test_a_time_is_written_in_its_unit(seconds, text):
+    assert progress.time_text(seconds) == text
 
 
 @pytest.mark.parametrize(

@@ -25,11 +25,10 @@ from ..inverse_design.plate import depth_for_strokes, for_detail, resolved_strok
 from ..inverse_design.search import WHITE
 from ..inverse_design.target import finest_strokes
 from ..precomputation.surface_text import converted
-from ..progress import bytes_text, progress_bar, say, show, table, tell
+from ..progress import bytes_text, progress_bar, say, show, table, takes_long, tell, time_text
 from .arguments import Overwrite, check_suffix, named_as_options, parse_numbers
 from .render import Stopped
 
-_MIN_SAID_TIME = 90.0  # s, that a search takes
 _MIN_SAID_MEMORY = 1e9  # bytes
 _MIN_TEXELS, _MAX_TEXELS = 32, 96  # along the period by default; more take minutes
 _LEGIBLE = 2 / 3  # of the texels of --detail, with which letters can be read
@@ -183,9 +182,8 @@ def _sigterm_interrupts() -> Iterator[None]:
 def _say_effort(chosen: str, seconds: float, memory: float) -> None:
     if chosen:
         say("note", chosen)
-    if seconds > _MIN_SAID_TIME or memory > _MIN_SAID_MEMORY:
-        minutes = f"{seconds / 60:.0f} min" if seconds > _MIN_SAID_TIME else f"{seconds:.0f} s"
-        effort = f"about {minutes} and {bytes_text(memory)} of memory"
+    if takes_long(seconds) or memory > _MIN_SAID_MEMORY:
+        effort = f"about {time_text(seconds)} and {bytes_text(memory)} of memory"
         say("note", f"{effort}; Ctrl-C ends the search and keeps the best relief so far")
 
 

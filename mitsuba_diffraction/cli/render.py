@@ -14,7 +14,7 @@ import typer
 
 from ..errors import RequestError
 from ..files.outputs import check_outputs, free_name
-from ..progress import bytes_text, durations, progress_bar, say, stage, tell
+from ..progress import bytes_text, durations, progress_bar, say, stage, takes_long, tell, time_text
 from .arguments import Define, Overwrite, Variant, check_suffix, materials_of, scene_parameters
 
 if TYPE_CHECKING:
@@ -26,7 +26,6 @@ if TYPE_CHECKING:
     from ..render.spectral_image import SpectralImage
 
 _log = logging.getLogger(__name__)
-MIN_ANNOUNCED_SECONDS = 60
 MIN_WARNED_SECONDS = 3600
 
 
@@ -150,6 +149,7 @@ def render(
     factor = None if exposure is None else 2**exposure
     with durations():
         for number, (path, motion) in enumerate(zip(pictures, motions, strict=True)):
+            begin = time.perf_counter()
             factor = _picture(
                 scene_file.moved(motion),
                 path,
@@ -162,6 +162,9 @@ def render(
                 exposure=factor,
                 complete=f"{number} of {len(pictures)} pictures are complete" if number else None,
             )
+            if number == 0 and not resume:
+                _announce_others(scene.name, len(pictures) - 1, time.perf_counter() - begin)
+            request.pop("announce", None)
         if frames is not None:
             for animation in animations_of(target):
                 save_animation([_preview(path) for path in pictures], animation)
@@ -171,13 +174,13 @@ def render(
 def _announce(
     label: str, bytes_per_number: int, planes: int, wavelengths: int | None, named: int | None, estimate: Estimate
 ) -> None:
-    """Print what a rendering of more than a minute needs.
+    """Print what a rendering needs that goes on for more than a few seconds.
 
     Args:
         planes: of the picture, in addition to one for each of its `wavelengths` (None: all).
         named: the sample count, if the scene names it.
     """
-    if estimate.seconds < MIN_ANNOUNCED_SECONDS:
+    if not takes_long(estimate.seconds):
         return
     planes += estimate.channels if wavelengths is None else wavelengths
     size = bytes_per_number * planes * estimate.columns * estimate.rows
@@ -185,7 +188,7 @@ def _announce(
     say(
         label,
         f"{estimate.columns} × {estimate.rows} pixels, {estimate.spp} samples per pixel: about "
-        f"{estimate.seconds / 60:.0f} min, {bytes_text(estimate.memory)} of memory{disk}, a picture of "
+        f"{time_text(estimate.seconds)}, {bytes_text(estimate.memory)} of memory{disk}, a picture of "
         f"{bytes_text(size)} before compression",
     )
     if named is not None and estimate.seconds > MIN_WARNED_SECONDS:
@@ -194,6 +197,12 @@ def _announce(
             named,
             estimate.seconds / 3600,
         )
+
+
+def _announce_others(label: str, pictures: int, seconds: float) -> None:
+    """Print how long the other pictures of an orbit take, from the time of the first."""
+    if pictures and takes_long(pictures * seconds):
+        say(label, f"other pictures ({pictures}): about {time_text(pictures * seconds)}")
 
 
 def _requests_denoising(scene: Path) -> bool:

@@ -12,11 +12,13 @@ import signal
 import tempfile
 import threading
 import time
+from bisect import bisect_left
 from collections.abc import Callable, Generator, Iterator
 from contextlib import closing, contextmanager, nullcontext
 from dataclasses import asdict, dataclass, replace
 from functools import cache, partial
 from importlib import metadata
+from itertools import accumulate, chain
 from pathlib import Path
 
 import mitsuba as mi
@@ -56,6 +58,10 @@ SAMPLES_PER_PIXEL_OF_LARGE_PICTURES = 8
 _MIN_PASSES_FOR_ERROR = 4
 _MIN_PASSES_UNTIL_ERROR = 16
 _MAX_PASSES = 10**6  # weeks, at some seconds each
+# Two short passes come first: one that compiles, and one that tells early how long the picture takes. Not of pictures
+# of some seconds, nor where two passes of any size are at most a tenth of the work.
+_SHORT_PASS = 1 / 32  # of the samples per pixel
+MIN_SPP_FOR_SHORT_PASSES, MIN_SAMPLES_FOR_SHORT_PASSES, _MAX_PASSES_WITH_SHORT = 16, 2**20, 19
 MIN_CHECKPOINT_INTERVAL = 20  # in units of the time that writing a checkpoint takes
 
 
@@ -193,7 +199,7 @@ def render(
         progress: called at the start and after each pass with the samples per pixel done, in total (with `until_error`,
             extrapolated from the current error), and the current error (NaN before four passes).
         announce: called after two passes (of the bands of a large picture: the first compiles), and again after a tenth
-            of them if the time differs by more than a quarter from what was announced.
+            of the work if the time differs by more than a quarter from what was announced.
         on_load: called with the scene before the first pass, unless the picture is `finished`.
         on_checkpoint: called after each checkpoint, while rendering goes on, with the picture so far. To bound memory,
             it is read from the sums block by block.
@@ -260,8 +266,9 @@ def _trace(
 ) -> bool:
     """Add passes to the sums until the picture is complete or Ctrl-C was pressed; return whether it is complete."""
     first, work = sums.done, [samples for samples in job.samples for _ in job.bands]
-    # Bands differ: the second estimate is made after a tenth of the work, and after all bands.
-    estimates = {first + 2, first + max(2, 1 + len(job.bands), math.ceil((len(work) - first) / 10))}
+    # Bands and passes differ: the second estimate is made after a tenth of the work, and after all bands.
+    tenth = bisect_left(list(accumulate(work[first:])), sum(work[first:]) / 10) + 1
+    estimates = {first + 2, first + max(1 + len(job.bands), tenth)}
     spent, before, expected = 0.0, 0.0, 0.0
     complete = _is_complete(sums, job, progress)
     last_checkpoint, interval = time.monotonic(), seconds
@@ -376,8 +383,9 @@ def _warn_of_implausible_pixels(luminance: NDArray[np.float32], limit: float) ->
 def split(scene: mi.Scene, spp: int, min_passes: int = 1) -> tuple[int, ...]:
     """Return the samples per pixel of each pass; at least `min_passes` passes, if there are enough samples.
 
-    They are numbers that the sampler draws (`max_samples`). If its smallest one does not divide `spp`, the last pass
-    exceeds that. They are determined by the request only, so that an interruption does not change the passes.
+    Where they are few, two short ones come first. They are numbers that the sampler draws (`max_samples`). If its
+    smallest one does not divide `spp`, the last pass exceeds that. They are determined by the request only, so that an
+    interruption does not change the passes.
     """
     sampler = scene.sensors()[0].sampler()
     pixels = math.prod(scene.sensors()[0].film().crop_size())
@@ -385,7 +393,16 @@ def split(scene: mi.Scene, spp: int, min_passes: int = 1) -> tuple[int, ...]:
     if passes > _MAX_PASSES:
         raise RequestError(f"spp: got {spp}, wanted at most {_MAX_PASSES * spp // passes:.2g} for so large a picture")
     passes = min(max(passes, min_passes), spp)
-    ends = (spp * index // passes for index in range(1, passes))
+    short = 0
+    if (
+        min_passes == 1
+        and passes * len(bands_of(scene)) <= _MAX_PASSES_WITH_SHORT
+        and spp >= MIN_SPP_FOR_SHORT_PASSES
+        and spp * pixels >= MIN_SAMPLES_FOR_SHORT_PASSES
+    ):
+        short = max(1, round(_SHORT_PASS * spp))
+    rest = spp - 2 * short
+    ends = chain([short, 2 * short] if short else [], (2 * short + rest * k // passes for k in range(1, passes)))
     largest, smallest = cache(partial(max_samples, sampler)), sampler_of(sampler, 1).sample_count()
     samples: list[int] = []
     total = 0

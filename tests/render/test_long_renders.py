@@ -15,7 +15,7 @@ import numpy as np
 import pytest
 from PIL import Image
 
-import mitsuba_diffraction  # noqa: F401 (settles which LLVM is used before a variant is set)
+from mitsuba_diffraction import progress  # settles which LLVM is used before a variant is set
 from mitsuba_diffraction.files.writing import exclusive
 from mitsuba_diffraction.optics.color import spectrum_to_XYZ
 from mitsuba_diffraction.render import SpectralImage, passes, render
@@ -468,10 +468,10 @@ def test_the_command_announces_long_renderings_and_takes_an_exposure(command, mo
     code, out, err = command(f"{RENDER} -o out.exr --exposure -1.5")
     assert (code, err) == (0, "")
     assert "out.png: preview, exposed by -1.50 stops (--exposure -1.50)" in out
-    monkeypatch.setattr(module, "MIN_ANNOUNCED_SECONDS", 0)
+    monkeypatch.setattr(progress, "MIN_ANNOUNCED_SECONDS", 0)
     code, out, err = command(f"{RENDER} -o out.exr --spp 4")
     assert code == 0
-    assert "16 × 16 pixels, 4 samples per pixel: about 0 min, 224 kB of memory" in err
+    assert "16 × 16 pixels, 4 samples per pixel: about 0 s, 224 kB of memory" in err
     assert "a picture of 49 kB before compression" in err
     assert len(err.splitlines()) == 1
     assert re.search(r"exposed by \+?(-?\d+\.\d\d) stops \(--exposure \1\)", out)
@@ -668,9 +668,13 @@ def test_a_second_ctrl_c_in_a_turntable_reports_completed_pictures(command, monk
     assert files() == {"scene.xml", "out_000.exr", "out_000.png"}
 
 
-def test_a_turntable_of_pictures_alone(command):
+def test_a_turntable_of_pictures_alone(command, monkeypatch):
+    monkeypatch.setattr(progress, "MIN_ANNOUNCED_SECONDS", 0)
     line = f"{RENDER} -o out.jpg --frames 2 --orbit --spp 1"
-    assert command(line)[0] == 0
+    code, _, err = command(line)
+    assert code == 0
+    # A time of each picture is not said again and again.
+    assert re.fullmatch(r"mitsuba-diffraction: scene.xml: other pictures \(1\): about \d+ s\n", err)
     assert files() == {"scene.xml", "out.webp", "out.gif", "out.mp4", "out_000.jpg", "out_001.jpg"}
     code, out, _ = command(f"{line} --resume")
     assert (code, out.count("complete, nothing to do")) == (0, 2)
