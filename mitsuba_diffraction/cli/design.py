@@ -21,7 +21,7 @@ from ..files.picture_file import read_picture
 from ..inverse_design import Design, Verdict, makers
 from ..inverse_design import design as search
 from ..inverse_design.output import SUFFIXES, save
-from ..inverse_design.plate import depth_for_strokes, for_detail, resolved_strokes
+from ..inverse_design.plate import MIN_STROKES, depth_for_strokes, for_detail, resolved_strokes
 from ..inverse_design.search import WHITE
 from ..inverse_design.target import finest_strokes
 from ..precomputation.surface_text import converted
@@ -32,7 +32,7 @@ from .render import Stopped
 _MIN_SAID_MEMORY = 1e9  # bytes
 _MIN_TEXELS, _MAX_TEXELS = 32, 96  # along the period by default; more take minutes
 _LEGIBLE = 2 / 3  # of the texels of --detail, with which letters can be read
-_OPTIONS = {name: f"--{name.replace('_', '-')}" for name in ("detail", *inspect.signature(search).parameters)}
+_OPTIONS = {name: f"--{name.replace('_', '-')}" for name in ("detail", "export", *inspect.signature(search).parameters)}
 _OPTIONS["wavelengths"] = "--wavelength"
 
 
@@ -89,9 +89,10 @@ def design(
     path = output or Path(f"{default}.gsf")
     check_suffix("-o", path, ".gsf", ".tif")
     picture = read_picture(target, invert=invert)
-    exports = makers.export_paths(export or [], path)
-    if "gds" in exports:
-        makers.check_gds(levels)
+    with named_as_options(_OPTIONS):
+        exports = makers.export_paths(export or [], path)
+        if "gds" in exports:
+            makers.check_gds(levels)
     outputs = [path.with_suffix(suffix) for suffix in SUFFIXES]
     outputs += exports.values()
     check_outputs([target], [("-o", output) for output in outputs], overwrite=overwrite)
@@ -121,7 +122,7 @@ def design(
             f"1/{detail:g} of the picture"
         )
     elif texels is None:
-        fitting = math.ceil(_LEGIBLE * strokes / resolved_strokes(1, texel, angle, longest))
+        fitting = math.ceil(max(_LEGIBLE * strokes, MIN_STROKES) / resolved_strokes(1, texel, angle, longest))
         texels = min(max(fitting, _MIN_TEXELS), _MAX_TEXELS)
         finest = f"the finest strokes are 1/{strokes:.0f} of the picture"
         note = f"{texels} texels along the period, {height_range:g} µm deep; {finest}"
@@ -156,7 +157,7 @@ def design(
     )
     for name, file in exports.items():
         tell(f"{file}: {makers.EXPORTS[name][1]}")
-    verdict = Verdict.of(found, strokes, inverted=invert)
+    verdict = Verdict.of(found, strokes, inverted=invert, names=_OPTIONS | {"negative": "--invert"})
     for warning in filter(None, [found.warning, "" if verdict.grade == "good" else str(verdict)]):
         tell(f"! {warning}")
     if verdict.grade == "good":

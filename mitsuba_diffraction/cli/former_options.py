@@ -5,13 +5,13 @@ Version 0.5 knows only those of `_LASTING`, which scripts rely on.
 
 from __future__ import annotations
 
-import os
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
 from ..errors import RequestError, shell_command
 from ..precomputation.recipe import FLAGS, SCAN_KEYS
+from ..precomputation.surface_text import split_source
 from ..settings import SPECTRUM_PARAMETERS
 from ..surface.gratings import PROFILES
 from .arguments import SURFACE
@@ -85,6 +85,6 @@ def add_options(command: Any, context: Any, given: Given) -> str:
 
 
 def _is_scan(surface: str) -> bool:
-    path = Path(surface if os.path.isfile(surface) else surface.partition(",")[0])
+    path = Path(split_source(surface)[0])
     is_file = path.is_file() or bool(path.suffix)
     return is_file and str(path) not in PROFILES and path.suffix.lower() not in (".toml", ".exr")

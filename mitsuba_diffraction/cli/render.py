@@ -15,7 +15,7 @@ import typer
 from ..errors import RequestError
 from ..files.outputs import check_outputs, free_name
 from ..progress import bytes_text, durations, progress_bar, say, stage, takes_long, tell, time_text
-from .arguments import Define, Overwrite, Variant, check_suffix, materials_of, scene_parameters
+from .arguments import Define, Overwrite, Variant, check_suffix, materials_of, named_as_options, scene_parameters
 
 if TYPE_CHECKING:
     import mitsuba as mi
@@ -105,7 +105,8 @@ def render(
     # Before Mitsuba, which takes more than a second to start.
     stored = {"half": False if single else None, "rgb": rgb, "channels": channels}
     _check_output(output, stored)
-    shown = neutral_view if view is None else ocio_view(view)
+    with named_as_options({"view": "--view"}):
+        shown = neutral_view if view is None else ocio_view(view)
     if (frames is not None) != orbit:
         raise RequestError("--frames N and --orbit go together")
 
@@ -292,7 +293,8 @@ def _picture(
     earlier = stored_digest(path) if resume and path.is_file() and not checkpoint.exists() else None
     scenes: list[mi.Scene] = []
     if denoise:
-        check_requirements()
+        with named_as_options({"denoise": "--denoise"}):
+            check_requirements()
         request = {**request, "on_load": partial(_keep, scenes)}
     interrupted = False
     try:

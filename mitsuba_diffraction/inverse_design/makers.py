@@ -80,13 +80,13 @@ def check_gds(levels: int | None) -> tuple[Any, int]:
         ValueError: if the heights are not levels, or more than there are layers, or gdstk is not installed.
     """
     if levels is None:
-        raise RequestError("--export gds: got continuous heights, wanted levels (--levels)")
+        raise RequestError("levels: got none, and gds has a layer for each, wanted their number")
     if levels > _MAX_LAYER + 1:
-        raise RequestError(f"--export gds: got {levels} levels, wanted at most {_MAX_LAYER + 1}, one for each layer")
+        raise RequestError(f"levels: got {levels}, wanted at most {_MAX_LAYER + 1} for gds, one for each layer")
     try:
         import gdstk
     except ModuleNotFoundError:
-        raise RequestError(f"--export gds: gdstk is not installed; {pip_install('gds')}") from None
+        raise RequestError(f"export: gdstk is not installed; {pip_install('gds')}") from None
     return gdstk, levels
 
 
@@ -114,7 +114,7 @@ def export_paths(names: list[str], path: Path) -> dict[str, Path]:
         ValueError: on an unknown name.
     """
     if unknown := [name for name in names if name not in EXPORTS]:
-        raise RequestError(f"--export: got {unknown[0]!r}, wanted one of {', '.join(EXPORTS)}")
+        raise RequestError(f"export: got {unknown[0]!r}, wanted one of {', '.join(EXPORTS)}")
     return {name: path.with_name(path.stem + EXPORTS[name][0]) for name in dict.fromkeys(names)}
 
 

@@ -16,6 +16,7 @@ from .far_field import blurred_texels
 
 _MAX_TEXELS = 256
 _ORDERS_PER_STROKE = 3.0  # of the finest strokes of a picture; see the eye chart in docs/design.md
+MIN_STROKES = 4 / _ORDERS_PER_STROKE  # of a plate whose period is two orders across half the picture
 _MAX_ANGLE = 30.0  # degrees, that `for_detail` takes
 _MAX_PATH = 16.0  # largest path difference in wavelengths; deeper reliefs are far outside of scalar theory
 _HEIGHT_RANGE = 0.8  # µm, at least
@@ -145,8 +146,9 @@ class Plate:
             )
         if self.period * sine < 2 * longest:
             raise RequestError(
-                f"texels: got {self.texels} of {self.texel:g} µm, wanted a period of at least {2 * longest / sine:.3g} "
-                f"µm (2 λ/sin angle): orders are {longest / self.period:.2g} apart, the picture ends at {sine:.2g}"
+                f"texels: got {self.texels} of {self.texel:g} µm with an angle of {self.angle:g}°, wanted a period of "
+                f"at least {2 * longest / sine:.3g} µm (2 λ/sin angle), or a larger angle: orders are "
+                f"{longest / self.period:.2g} apart, the picture ends at {sine:.2g}"
             )
 
     @property

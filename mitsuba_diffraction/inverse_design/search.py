@@ -14,9 +14,9 @@ from numpy.typing import ArrayLike, NDArray
 
 from ..array_types import Real
 from ..errors import RequestError, check_whole
-from ..progress import Progress, silent
+from ..progress import Progress, bytes_text, silent
 from ..rigorous.solver import one_thread
-from ..settings import MIN_WAVELENGTH
+from ..settings import MIN_WAVELENGTH, available_memory
 from .far_field import FarField, lobes_in_bins, nearest_levels
 from .plate import Plate
 from .result import Design, memory_of_prediction
@@ -28,6 +28,7 @@ _FIRST_ITERATIONS, _LAST_ITERATIONS = 75, 400
 _FIXED_FRACTIONS = (0.4, 0.7, 0.9, 1.0)  # of the texels, that are set to levels one round after the other
 _LOSSES_PER_ITERATION = 1.1
 _TIMED_LOSSES = 5  # for the estimate of the time
+_MAX_MEMORY = 16e9  # bytes, where the system does not say how many are available
 _CORRECTIONS, _TOLERANCE = 20, 1e-8  # of L-BFGS-B: stored steps, and the decrease of L at which it ends
 
 
@@ -100,6 +101,7 @@ def design(
     check_whole("starts", starts, 1)
     check_whole("seed", seed, 0)
     wanted = wanted_fractions(target, plate)
+    _check_memory(plate)
     search = _Search(plate, with_unused(wanted, plate), starts, progress, expect)
     interrupted = False
     try:
@@ -112,6 +114,18 @@ def design(
     if plate.mirrored:  # m_x of each order changes its sign
         heights, wanted = heights[:, ::-1], wanted[..., ::-1]
     return Design.of(heights, plate, wanted, interrupted)
+
+
+def _check_memory(plate: Plate) -> None:
+    """Refuse a plate so large, as with a tiny angle, that its prediction does not fit into the memory."""
+    needed, available = memory_of_prediction(plate), available_memory() or _MAX_MEMORY
+    if needed > available:
+        largest = plate.period * math.sqrt(available / needed)
+        raise RequestError(
+            f"texel: got {plate.texels} of {plate.texel:g} µm, a period of {plate.period:.4g} µm, whose prediction "
+            f"takes {bytes_text(needed)} of memory, wanted at most the {bytes_text(available)} that are available: "
+            f"{largest:.3g} µm, with a larger angle"
+        )
 
 
 def _wavelengths(given: float | Sequence[float] | None) -> Real:

@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Mapping
 from dataclasses import dataclass
+from types import MappingProxyType
 
 import numpy as np
 
@@ -29,7 +31,7 @@ class Verdict:
     Attributes:
         grade: by `GOOD_BOUNDS` and `VISIBLE_BOUNDS`; at most "visible" where colours are poor.
         light, contrast, correlation: means over the wavelengths.
-        remedy: which option to change, or "".
+        remedy: which argument to change, or "".
         colours: "good", "fair" or "poor" by `COLOUR_BOUNDS`, with ΔE00; "" of a grey target and of a laser.
     """
 
@@ -41,8 +43,23 @@ class Verdict:
     colours: str = ""
 
     @classmethod
-    def of(cls, design: Design, strokes: float | None = None, *, inverted: bool = False) -> Verdict:
-        """Judge a design; for the remedy: its picture's finest strokes along an edge, and whether it is a negative."""
+    def of(
+        cls,
+        design: Design,
+        strokes: float | None = None,
+        *,
+        inverted: bool = False,
+        names: Mapping[str, str] = MappingProxyType({}),
+    ) -> Verdict:
+        """Judge a design.
+
+        Args:
+            design: the design.
+            strokes: its picture's finest strokes along an edge, for the remedy.
+            inverted: whether it casts the negative of the picture.
+            names: of the arguments of `design` in the remedy, by their names; "detail" and "negative" are options of
+                the command line alone.
+        """
         measures = design.light, design.contrast, float(np.mean(design.correlation))
         grade = next(
             (
@@ -58,7 +75,9 @@ class Verdict:
             colours = f"{name} (ΔE00 {difference:.0f})"
             if name == "poor" and grade == "good":
                 grade, remedy = "visible", _NO_PIGMENTS
-        return cls(grade, *measures, "" if grade == "good" else remedy or _remedy(design, strokes, inverted), colours)
+        if grade != "good":
+            remedy = remedy or _remedy(design, strokes, inverted, names)
+        return cls(grade, *measures, remedy, colours)
 
     def __str__(self) -> str:
         numbers = (
@@ -73,39 +92,47 @@ class Verdict:
         return f"{said}: {numbers}; {self.remedy}"
 
 
-def _remedy(design: Design, strokes: float | None, inverted: bool) -> str:
-    """Return the option that most likely helps, the first cause that is found."""
+def _remedy(design: Design, strokes: float | None, inverted: bool, names: Mapping[str, str]) -> str:
+    """Return the argument that most likely helps, the first cause that is found."""
+
+    def named(name: str) -> str:
+        return names.get(name, name)
+
     plate = design.plate
     wave = _depth(plate)  # µm, of a path difference of one wavelength
-    path = plate.height_range / wave
+    path, depth = plate.height_range / wave, named("height_range")
     if path < _MIN_PATH:
-        return f"the relief is too shallow: raise --height-range to {3 * wave:.2g} µm, or at least {wave:.2g}"
+        return f"the relief is too shallow: raise {depth} to {3 * wave:.2g} µm, or at least {wave:.2g}"
     if plate.levels == 2:
         return (
-            "two levels send as much light into the picture turned by half a circle: raise --levels to 4 or more, with "
-            f"--height-range {wave * 3 / 4:.2g}"
+            f"two levels send as much light into the picture turned by half a circle: raise {named('levels')} to 4 or "
+            f"more, with {depth} {wave * 3 / 4:.2g}"
         )
     if plate.levels is not None and path / (plate.levels - 1) > _MAX_STEP:
         count = 1 + math.ceil(path / _MAX_STEP)
         return (
-            f"the steps are too high: raise --levels to {count} or more, or lower --height-range to "
+            f"the steps are too high: raise {named('levels')} to {count} or more, or lower {depth} to "
             f"{wave * (plate.levels - 1) / plate.levels:.2g} µm"
         )
     if plate.tool_blur > plate.texel:
-        return f"the tool is too blunt: --tool-blur of at most a texel, {plate.texel:.2g} µm"
+        return f"the tool is too blunt: {named('tool_blur')} of at most a texel, {plate.texel:.2g} µm"
     if design.inside.mean() > _MAX_LIT:
-        option = "without --invert, its other parts are cast" if inverted else "--invert casts its dark parts instead"
-        return f"most of the picture is light: {option}"
+        negative = names.get("negative", "its negative")
+        cast = (
+            f"without {negative}, its other parts are cast" if inverted else f"{negative} casts its dark parts instead"
+        )
+        return f"most of the picture is light: {cast}"
     if strokes is not None and plate.levels is None and plate.wavelengths.size > 1:
         deep = depth_for_strokes(strokes, plate.wavelengths, plate.int_ior)
         if plate.height_range < _SHALLOW * deep:
-            return f"facets are too short for its strokes in light of many wavelengths: --height-range {deep:.2g}"
+            return f"facets are too short for its strokes in light of many wavelengths: {depth} {deep:.2g}"
     resolved = resolved_strokes(plate.texels, plate.texel, plate.angle, float(plate.wavelengths.max()))
     if strokes is not None and strokes > resolved:
+        texels = math.ceil(plate.texels * strokes / resolved)
         return (
             f"its finest strokes are 1/{strokes:.0f} of it, and the plate resolves 1/{resolved:.0f}: "
-            f"--detail {strokes:.0f}"
-            + ("" if plate.wavelengths.size == 1 else ", or the light of a laser, such as --wavelength 532")
+            + (f"{names['detail']} {strokes:.0f}" if "detail" in names else f"texels {texels}")
+            + ("" if plate.wavelengths.size == 1 else f", or the light of a laser, such as {named('wavelengths')} 532")
         )
     return "use a picture of less detail"
 

@@ -361,7 +361,7 @@ def ocio_view(name: str) -> ViewTransform:
     try:
         import PyOpenColorIO as ocio
     except ModuleNotFoundError:
-        raise RequestError(f"--view: opencolorio is not installed; {pip_install('ocio')}") from None
+        raise RequestError(f"view: opencolorio is not installed; {pip_install('ocio')}") from None
     source = os.environ.get("OCIO") or "ocio://default"
     try:
         config = ocio.Config.CreateFromFile(source)
@@ -369,10 +369,10 @@ def ocio_view(name: str) -> ViewTransform:
         views = list(config.getViews(display))
         view = min((view for view in views if view.casefold().startswith(name.casefold())), key=len, default=None)
         if view is None:
-            raise RequestError(f"--view: got {name!r}, the views of {source} are {', '.join(views)}")
+            raise RequestError(f"view: got {name!r}, the views of {source} are {', '.join(views)}")
         transform = config.getProcessor("cie_xyz_d65_interchange", display, view, ocio.TRANSFORM_DIR_FORWARD)
     except (ocio.Exception, ocio.ExceptionMissingFile) as error:
-        raise RequestError(f"--view: {source} cannot be used by OpenColorIO ({' '.join(str(error).split())})") from None
+        raise RequestError(f"view: {source} cannot be used by OpenColorIO ({' '.join(str(error).split())})") from None
     processor = transform.getDefaultCPUProcessor()
 
     def shown(rgb: NDArray[np.floating]) -> NDArray[np.floating]:

@@ -26,11 +26,9 @@ def parsed(text: str) -> tuple[str, dict[str, Any]]:
     Raises:
         RequestError: if a part is not name=value, a name is repeated that has no list, or there is no such surface.
     """
-    parts = text.split(",")
-    ends = range(len(parts), 1, -1)
-    end = next((end for end in ends if os.path.exists(",".join(parts[:end]))), 1)
-    source, values = ",".join(parts[:end]), dict[str, Any]()
-    for name, equals, value in (item.strip().partition("=") for item in _items(parts[end:])):
+    source, parts = split_source(text)
+    values = dict[str, Any]()
+    for name, equals, value in (item.strip().partition("=") for item in _items(parts)):
         if not (name and equals and value) or (name in values and name not in _LISTS):
             got = f"{text}: got {name + equals + value!r}"
             raise RequestError(f"{got}, wanted name=value, each name once{_no_lists(name)}")
@@ -40,6 +38,13 @@ def parsed(text: str) -> tuple[str, dict[str, Any]]:
         say("note", f"{source} is the measured skin; {RENAMED[source]} is a synthetic one")
     single = {name: values[name][0] for name in _LISTS[:-1] if len(values.get(name, ())) == 1}
     return source_named(source), values | single
+
+
+def split_source(text: str) -> tuple[str, list[str]]:
+    """Return the source as it is written, the longest beginning that is a file, and the parts after it."""
+    parts = text.split(",")
+    end = next((end for end in range(len(parts), 1, -1) if os.path.exists(",".join(parts[:end]))), 1)
+    return ",".join(parts[:end]), parts[end:]
 
 
 def _items(parts: list[str]) -> Iterator[str]:

@@ -66,7 +66,7 @@ def check_requirements() -> None:
     try:
         import pyoidn  # noqa: F401
     except ModuleNotFoundError:
-        raise RequestError(f"--denoise: pyoidn is not installed; {pip_install('denoise')}") from None
+        raise RequestError(f"denoise: pyoidn is not installed; {pip_install('denoise')}") from None
 
 
 def guides(scene: mi.Scene, band: Rows | None = None) -> Guides:

@@ -15,7 +15,6 @@ import tempfile
 from bisect import bisect_right
 from collections.abc import Callable
 from itertools import pairwise
-from pathlib import Path
 from typing import Any
 
 import drjit as dr
@@ -27,6 +26,7 @@ from ..bsdf.light import recorded_wavelengths
 from ..errors import RequestError, root_cause
 from ..integrator.paths import LightPaths, random_numbers, unpacked
 from ..progress import bytes_text
+from ..settings import available_memory
 from .scene import no_warnings, recorded_range
 from .spectral_film import channel_wavelengths, channel_weights
 
@@ -138,15 +138,6 @@ def check_memory(scene: mi.Scene, spp: int, bands: tuple[Rows, ...] | None = Non
             f"{bytes_text(available)} that are available"
         )
     return needed
-
-
-def available_memory() -> int | None:
-    """Return the number of bytes that processes can allocate, swap included; None if unknown."""
-    try:
-        entries = dict(line.split(":") for line in Path("/proc/meminfo").read_text("ascii").splitlines())
-        return 1024 * sum(int(entries[name].split()[0]) for name in ("MemAvailable", "SwapFree"))
-    except (OSError, KeyError, ValueError):
-        return None
 
 
 def sampler_of(sampler: mi.Sampler, spp: int) -> mi.Sampler:

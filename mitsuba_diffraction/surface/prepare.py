@@ -7,13 +7,14 @@ Each step takes a height field and returns a new one, whose `source` records the
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
+from contextlib import suppress
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy import ndimage
 
-from ..errors import RequestError, is_number
+from ..errors import RequestError, did_you_mean, is_number
 from .heightfield import HeightField, harmonic_fill
 from .periods import Period, find_periods
 
@@ -408,14 +409,24 @@ def apply_steps(height_field: HeightField, steps: Sequence[Step]) -> HeightField
 
 
 def step_of(text: str) -> Step:
-    """Parse a step given on the command line: `level_plane`, `despike=4`, `crop_periods=x`."""
-    name, equals, argument = text.partition("=")
-    if not equals:
-        return name
-    try:
-        return {name: float(argument)}
-    except ValueError:
-        return {name: argument}
+    """Parse a step given on the command line: `level_plane`, `despike=4`, `crop_periods=x`.
+
+    Raises:
+        ValueError: if there is no such step, or its argument is missing or wrong.
+    """
+    name, equals, value = text.partition("=")
+    if name not in _STEPS:
+        raise RequestError(f"prepare: got {text}, wanted one of {', '.join(_STEPS)}{did_you_mean(name, _STEPS)}")
+    argument: float | str = value
+    with suppress(ValueError):
+        argument = float(value)
+    _, is_valid, wanted = _STEPS[name]
+    if equals and not is_valid(argument):
+        form = name if (is_valid, wanted) == _NO_ARGUMENT else f"{name}=…"
+        raise RequestError(f"prepare: got {text}, wanted {form}, {wanted}")
+    if not equals and name in _ARGUMENT_REQUIRED:
+        raise RequestError(f"prepare: got {text}, wanted {name}=…, {wanted}")
+    return {name: argument} if equals else name
 
 
 def _after(

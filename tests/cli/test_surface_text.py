@@ -139,6 +139,13 @@ def test_options_beside_a_scan_are_those_of_the_scan(command, computed):
     assert ["pixel_size" in recipe.surface for recipe in computed] == [False, True]
 
 
+def test_options_beside_a_scan_whose_name_has_commas_are_those_of_the_scan(command, computed):
+    Path("scan.npy").rename("blazed,depth=1.npy")
+    code, _, error = command("precompute blazed blazed,depth=1.npy,tolerance=0.1 --pixel-size 1")
+    assert code == 0
+    assert "given as blazed blazed,depth=1.npy,tolerance=0.1,pixel_size=1 from version 0.5 on" in error
+
+
 @pytest.mark.parametrize(
     ("text", "source", "values"),
     [

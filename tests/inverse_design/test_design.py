@@ -316,10 +316,10 @@ def test_the_target_has_the_colours_of_the_picture_and_the_prediction_those_of_i
 @pytest.mark.parametrize(
     ("options", "words"),
     [
-        ({"levels": 2}, ["the picture fails: ", "raise --levels to 4 or more, with --height-range 0.2"]),
-        ({"levels": 3}, ["the picture fails: ", "raise --levels to 8 or more, or lower --height-range to 0.18"]),
-        ({"height_range": 0.02}, ["the picture fails: ", "the relief is too shallow: raise --height-range to 0.8"]),
-        ({"int_ior": 1.0001}, ["the picture fails: ", "raise --height-range to "]),
+        ({"levels": 2}, ["the picture fails: ", "raise levels to 4 or more, with height_range 0.2"]),
+        ({"levels": 3}, ["the picture fails: ", "raise levels to 8 or more, or lower height_range to 0.18"]),
+        ({"height_range": 0.02}, ["the picture fails: ", "the relief is too shallow: raise height_range to 0.8"]),
+        ({"int_ior": 1.0001}, ["the picture fails: ", "raise height_range to "]),
         ({"tool_blur": 1.8}, ["the picture can be seen, but is pale or uneven: ", "the tool is too blunt"]),
     ],
 )
@@ -341,9 +341,28 @@ def test_of_a_negative_the_option_that_was_given_is_no_remedy():
     picture = np.ones((8, 8))
     picture[:2, :2] = 0
     found = Design.of(0.6 * np.random.default_rng(0).random((12, 12)), plate, wanted_fractions(picture, plate))
-    assert Verdict.of(found).remedy == "most of the picture is light: --invert casts its dark parts instead"
-    remedy = Verdict.of(found, inverted=True).remedy
+    assert Verdict.of(found).remedy == "most of the picture is light: its negative casts its dark parts instead"
+    remedy = Verdict.of(found, inverted=True, names={"negative": "--invert"}).remedy
     assert remedy == "most of the picture is light: without --invert, its other parts are cast"
+
+
+def test_a_remedy_names_arguments_of_python_or_options_of_the_command():
+    plate = Plate(1.0, 12, 0.6, 17.5, np.array([532.0]), None, None, 0.1)
+    picture = np.zeros((8, 8))
+    picture[:2, :2] = 1
+    found = Design.of(0.6 * np.random.default_rng(0).random((12, 12)), plate, wanted_fractions(picture, plate))
+    finer = "its finest strokes are 1/8 of it, and the plate resolves 1/5: "
+    assert Verdict.of(found, 8.0).remedy == finer + "texels 22"
+    assert Verdict.of(found, 8.0, names={"detail": "--detail"}).remedy == finer + "--detail 8"
+
+
+def test_a_plate_that_does_not_fit_into_the_memory_is_refused(monkeypatch):
+    """A picture of half a degree, in texels of 20 µm, took 32 GB."""
+    monkeypatch.setattr("mitsuba_diffraction.inverse_design.search.available_memory", lambda: 10**9)
+    monkeypatch.setattr("mitsuba_diffraction.inverse_design.search._Search", None)
+    message = r"^texel: got 32 of 20 µm, a period of 640 µm, whose prediction takes 32 GB of memory"
+    with pytest.raises(ValueError, match=message):
+        md.design(np.eye(8), texel=20.0, angle=0.5)
 
 
 def test_depth_is_no_remedy_in_light_of_one_wavelength():
@@ -353,7 +372,7 @@ def test_depth_is_no_remedy_in_light_of_one_wavelength():
     for wavelengths, is_remedy in (([532.0], False), ([430.0, 670.0], True)):
         plate = Plate(1.0, 12, 0.5, 17.5, np.array(wavelengths), None, None, 0.1)
         found = Design.of(heights, plate, wanted_fractions(picture, plate))
-        assert ("--height-range" in Verdict.of(found, 4.0).remedy) == is_remedy
+        assert ("height_range" in Verdict.of(found, 4.0).remedy) == is_remedy
 
 
 @pytest.mark.parametrize("options", [{"levels": 4, "height_range": 0.2}, {"levels": 3, "height_range": 0.18}])
@@ -443,7 +462,11 @@ CENTRE[31:34, 31:34] = 1
         (np.eye(8), {"unused": "nowhere"}, "unused: got 'nowhere', wanted outside or mirror"),
         (np.eye(8), {"texel": 0.3}, "texel: got 0.3 µm, wanted more than half the wavelength, 0.335 µm"),
         (np.eye(8), {"texel": 3}, "texel: got 3 µm with an angle of 17.5°, wanted less than 2.23 µm"),
-        (np.eye(8), {"texels": 5}, "texels: got 5 of 0.8 µm, wanted a period of at least 4.46 µm"),
+        (
+            np.eye(8),
+            {"texels": 5},
+            "texels: got 5 of 0.8 µm with an angle of 17.5°, wanted a period of at least 4.46 µm",
+        ),
         (np.eye(8), {"texels": 32.5}, "texels: got 32.5, wanted a whole number"),
         (np.eye(8), {"height_range": 0}, "height_range: got 0, wanted a positive number of µm"),
         (np.eye(8), {"height_range": 800}, "height_range: got 800 µm, .* wanted at most 3.46 µm, 16 wavelengths"),

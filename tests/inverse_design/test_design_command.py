@@ -80,6 +80,10 @@ def test_texels_follow_from_the_finest_strokes_of_the_picture(command):
     code, _, error = command("design flag.png --wavelength 532 --height-range 0.3 --starts 1")
     assert code == 0
     assert "note: 32 texels along the period, 0.3 µm deep; the finest strokes are 1/7 of the picture" in error
+    Image.fromarray(np.repeat([0, 255], 32).astype(np.uint8)[None].repeat(64, 0)).save("half.png")
+    code, _, error = command("design half.png --wavelength 532 --angle 2 --starts 1")
+    assert code == 0
+    assert "note: 39 texels along the period" in error  # as many as two orders to each side take
 
 
 def test_a_target_is_a_picture_as_seen_on_a_screen():
@@ -183,8 +187,12 @@ def test_an_interrupted_command_writes_the_best_so_far(command, monkeypatch, num
         ("flag.png --texel 0.2", "error: --texel: got 0.2 µm, wanted more than half the wavelength"),
         ("flag.png --detail 8 --texels 12", "--detail: got 8 and --texels 12, wanted one of them"),
         ("flag.png --export obj", "--export: got 'obj', wanted one of stl, gds, master"),
-        ("flag.png --export gds", "--export gds: got continuous heights, wanted levels (--levels)"),
-        ("flag.png --export gds --levels 1000000", "--export gds: got 1000000 levels, wanted at most 32768, one for"),
+        ("flag.png --export gds", "--levels: got none, and gds has a layer for each, wanted their number"),
+        ("flag.png --export gds --levels 1000000", "--levels: got 1000000, wanted at most 32768 for gds, one for"),
+        (
+            "flag.png --angle 0.5",
+            "--texels: got 96 of 0.8 µm with an angle of 0.5°, wanted a period of at least",
+        ),
         ("flag.png --levels 1", "error: --levels: got 1, wanted a whole number of at least 2"),
         ("flag.png --wavelength 0.5", "error: --wavelength: got [0.5], wanted one or several in nm"),
         ("flag.png --height-range 800", "error: --height-range: got 800 µm"),

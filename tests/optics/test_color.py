@@ -208,7 +208,7 @@ def test_a_view_is_that_of_OpenImageIO(monkeypatch):
 
 def test_views_are_those_of_the_configuration(monkeypatch, tmp_path):
     monkeypatch.delenv("OCIO", raising=False)
-    with pytest.raises(ValueError, match=r"--view: got 'AgX', the views of ocio://default are ACES .*, Raw"):
+    with pytest.raises(ValueError, match=r"^view: got 'AgX', the views of ocio://default are ACES .*, Raw"):
         ocio_view("AgX")
     monkeypatch.setenv("OCIO", str(tmp_path / "gone.ocio"))
     with pytest.raises(ValueError, match=r"gone.ocio cannot be used by OpenColorIO \("):

@@ -64,7 +64,7 @@ def test_requests_that_cannot_be_met(llvm, tmp_path, monkeypatch):
     monkeypatch.setattr(trace_pass, "available_memory", lambda: 1000)
     one_line("film: got 8 × 8 pixels, which take .* that are available", lambda: render(path, spp=1))
     monkeypatch.setitem(sys.modules, "pyoidn", None)
-    one_line("--denoise: pyoidn is not installed", denoise.check_requirements)
+    one_line("denoise: pyoidn is not installed", denoise.check_requirements)
     monkeypatch.setitem(sys.modules, "distributed", None)
     one_line("a Dask cluster needs the package distributed", lambda: cluster.trace_on("tcp://a:1"), RuntimeError)
     one_line("wanted names of files and folders in UTF-8", lambda: render(tmp_path / "s\udce9.xml", spp=1))

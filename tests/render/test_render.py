@@ -23,6 +23,7 @@ from mitsuba_diffraction.render.scene_light import max_plausible_luminance
 from mitsuba_diffraction.render.spectral_film import channel_wavelengths, channel_weights
 from mitsuba_diffraction.render.spectral_image import save_preview
 from mitsuba_diffraction.render.trace_pass import trace_pass
+from mitsuba_diffraction.settings import available_memory
 
 GRID = channel_wavelengths()
 SCENES = Path(__file__).parents[2] / "scenes"
@@ -550,7 +551,7 @@ def test_a_picture_that_does_not_fit_into_memory_is_refused_before_it_is_traced(
 @pytest.mark.skipif(not Path("/proc/meminfo").exists(), reason="Linux alone reports it")
 def test_the_available_memory_is_that_of_the_system():
     pages = os.sysconf("SC_AVPHYS_PAGES") * os.sysconf("SC_PAGE_SIZE")
-    assert 0.5 * pages < tracing.available_memory()
+    assert 0.5 * pages < available_memory()
 
 
 DIRECTIONAL = '<emitter type="directional"><vector name="direction" x="0" y="0" z="-1"/></emitter>'

@@ -8,6 +8,7 @@ from hypothesis.extra import numpy as npst
 from scipy import ndimage
 
 import mitsuba_diffraction as md
+from mitsuba_diffraction.errors import RequestError
 from mitsuba_diffraction.surface import prepare
 from mitsuba_diffraction.surface.heightfield import HeightField
 from mitsuba_diffraction.surface.periods import find_periods
@@ -135,6 +136,23 @@ def test_wrong_steps_are_refused_before_a_scan_is_read(steps, message):
 def test_steps_are_parsed_as_they_are_typed(text, step):
     assert prepare.step_of(text) == step
     prepare.check_steps([prepare.step_of(text)])
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        ("rotate", "prepare: got rotate, wanted rotate=…, a number of degrees"),
+        ("rotate=x", "prepare: got rotate=x, wanted rotate=…, a number of degrees"),
+        ("crop_periods=z", "prepare: got crop_periods=z, wanted crop_periods=…, 'x', 'y' or 'xy'"),
+        ("level_plane=2", "prepare: got level_plane=2, wanted level_plane, no argument"),
+        ("rotte=3", "prepare: got rotte=3, wanted one of level_plane, level_quadratic, align_lines"),
+    ],
+)
+def test_a_wrong_step_is_quoted_as_it_was_typed(text, message):
+    """Not as in a recipe, `{ rotate = … }`."""
+    with pytest.raises(RequestError) as caught:
+        prepare.step_of(text)
+    assert str(caught.value).startswith(message)
 
 
 @pytest.mark.parametrize("extent", ["tile", "sample"])
