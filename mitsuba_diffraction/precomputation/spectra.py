@@ -125,8 +125,13 @@ def check_material(settings: Settings) -> None:
     try:
         index_of("material", settings.material).known("material").check((shortest, longest))
     except RequestError as error:
-        inside = f"; inside ext_ior={settings.ext_ior:g} wavelengths are shorter" if settings.ext_ior != 1 else ""
-        raise RequestError(f"{error}{inside}") from None
+        if settings.ext_ior == 1:
+            raise
+        (low, high), n = settings.wavelengths, settings.ext_ior
+        raise RequestError(
+            f"{error}; wavelengths are those inside ext_ior={n:g}: light of {low:g} to {high:g} nm in air has "
+            f"{low / n:.0f} to {high / n:.0f}"
+        ) from None
 
 
 def build_versions(settings: Settings) -> list[int]:

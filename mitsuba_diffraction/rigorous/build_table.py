@@ -85,7 +85,7 @@ _PAIR_WORK = 0.2  # of matching a field above and one below, in units of the eig
 _CHECKPOINT_SECONDS = 20.0  # between checkpoints, each of which is written as a whole
 # Directions for which the harmonics are chosen: near the normal, and oblique from both sides.
 _HARMONICS_DIRECTIONS = ((0.1, 0, 1), (0.8, 0.3, 0.5), (-0.8, 0.3, 0.5))
-BUILD_VERSION = 8  # raised when tables of equal requests change
+BUILD_VERSION = 9  # raised when tables of equal requests change
 MAX_POLARISATION_ERROR = 3.0
 """Bound of `polarisation_error`, in tolerances: matrices vary faster than η."""
 

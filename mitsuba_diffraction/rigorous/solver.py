@@ -235,6 +235,9 @@ def converge(curve: Curve, omega: Real, k_0: float, index: complex, tolerance: f
         # With p light, blazed metals converge as slowly as 1/N, and one change may be small by chance.
         before, change = change, _change(previous, found)
         found = dataclasses.replace(found, error=max(before + change, found.imbalance))
+        # A dielectric whose R + T is not one is far from the limit: the change from there is no error of what follows.
+        if previous.imbalance > tolerance and index.imag == 0:
+            change = 0.0
     return found
 
 

@@ -460,6 +460,10 @@ def test_precompute_writes_a_recipes_rigorous_spectrum(command, tmp_path):
     scalar = tmp_path / "scalar.toml"
     scalar.write_text('[surface]\nprofile = "sinusoidal"\nperiod = 0.19\ndepth = 0.05\nsamples = 32\n')
     values = "theory=rigorous,material=Al,ext_ior=1.5,polarised=true,tolerance=0.9"
+    code, _, err = command("precompute", f"{scalar},{values}", "-o", str(tmp_path / "metal.exr"))
+    assert (code, len(err.splitlines())) == (2, 1)
+    assert "inside ext_ior=1.5: light of 360 to 830 nm in air has 240 to 553" in err
+    values += ",wavelengths=240,wavelengths=553"
     code, out, _ = command("precompute", f"{scalar},{values}", "-o", str(tmp_path / "metal.exr"))
     assert code == 0
     assert "material Al below ext_ior 1.5, rigorous theory" in out
