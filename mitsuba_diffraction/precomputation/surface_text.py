@@ -31,7 +31,7 @@ def parsed(text: str) -> tuple[str, dict[str, Any]]:
     for name, equals, value in (item.strip().partition("=") for item in _items(parts)):
         if not (name and equals and value) or (name in values and name not in _LISTS):
             got = f"{text}: got {name + equals + value!r}"
-            raise RequestError(f"{got}, wanted name=value, each name once{_no_lists(name)}")
+            raise RequestError(f"{got}, wanted name=value, each name once{_advice(name, values)}")
         found = step_of(value) if name == "prepare" else converted(value)
         values[name] = [*values.get(name, []), found] if name in _LISTS else found
     if source in RENAMED:
@@ -56,9 +56,14 @@ def _items(parts: list[str]) -> Iterator[str]:
         parts = parts[count:]
 
 
-def _no_lists(name: str) -> str:
+def _advice(part: str, values: Mapping[str, Any]) -> str:
     """Return what to do if a part is the end of a list or of a number with a decimal comma, or ""."""
-    return "; a number has a point, and a list of films stands in a scene" if is_number(converted(name)) else ""
+    if not is_number(converted(part)):
+        return ""
+    last = next(reversed(values), "")
+    if last in _LISTS:
+        return f"; give a list as {last}={values[last][-1]},{last}={part}"
+    return "; a number has a point, and a list of films stands in a scene"
 
 
 def written(source: str, values: Mapping[str, Any]) -> str:

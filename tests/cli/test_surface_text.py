@@ -190,6 +190,7 @@ def test_a_file_may_have_commas_and_equals_signs_in_its_name(name, folder):
         ("blazed,colour=red", "blazed: got colour, wanted some of period, depth, "),
         ("blazed,depth=1,depth=2", "got 'depth=2', wanted name=value, each name once"),
         ("blazed,depth=1,5", "got '5', wanted name=value, each name once; a number has a point"),
+        ("blazed,wavelengths=400,700", "got '700', .*; give a list as wavelengths=400,wavelengths=700"),
         ("scan.npy,unit=", "got 'unit=', wanted name=value"),
         ("scan.npy,pixel_size=small", "pixel_size: got 'small'"),
     ],
