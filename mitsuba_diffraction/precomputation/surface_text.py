@@ -56,7 +56,7 @@ def _items(parts: list[str]) -> Iterator[str]:
         parts = parts[count:]
 
 
-def _advice(part: str, values: Mapping[str, Any]) -> str:
+def _advice(part: str, values: dict[str, Any]) -> str:
     """Return what to do if a part is the end of a list or of a number with a decimal comma, or ""."""
     if not is_number(converted(part)):
         return ""
