@@ -35,6 +35,7 @@ Rows = tuple[int, int]
 
 # A band of this many pixels, 1024 × 768, takes up to 1.3 GB.
 BAND_PIXELS = 3 * 2**18
+_GROUP = 4  # neighbouring pixels of which `collect` gathers the samples at once
 _SPOOLED_BYTES = 2**22  # in memory for each band
 
 # Index of a pixel (row by row), mask → index of its first sample and one past its last. Its samples are contiguous.
@@ -312,10 +313,9 @@ def _trace(
     covered = [dr.select(valid, mi.Float(1), 0)] if alpha else []
     dr.eval(position, channel, value, covered)
     collected = functools.partial(collect, rfilter, position, size=shape, margins=margins, samples=equal_ranges(count))
-    # In the memory of Dr.Jit, without a copy.
-    traced = np.asarray(collected(channel, value, channels=channels, earlier=sums)).reshape(*shape, -1)
+    traced = unfolded(collected(channel, value, channels=channels, earlier=sums), shape)
     if alpha:
-        coverage = np.array(collected([dr.zeros(mi.Float, size)], covered, channels=1)).reshape(*shape, 2)
+        coverage = unfolded(collected([dr.zeros(mi.Float, size)], covered, channels=1), shape)
         traced = np.concatenate([traced[..., :-1], coverage], axis=-1)
     return traced
 
@@ -389,41 +389,44 @@ def collect(
     channels: int,
     earlier: mi.Float | None = None,
 ) -> mi.Float:
-    """Gather the samples under the filter of each pixel, row by row, in one lane per pixel.
+    """Gather the samples under the filter of each pixel, in one lane for four pixels of a row.
 
     `channel` and `value` are lists; the value at a fractional channel is divided linearly between the two nearest
-    channels. The result has `channels` sums and then the sum of filter weights of each pixel. There are also samples in
-    the `margins`: pixels at each side, rows above and rows below. The sums of the channels are added to `earlier` sums.
+    channels. There are also samples in the `margins`: pixels at each side, rows above and rows below. `unfolded`
+    returns the sums, which are added to `earlier` ones, by pixel.
     """
     rows, columns = size
     sides, above, below = margins
     kernel_radius = _radius(rfilter)
     box = rfilter.is_box_filter()
-    width = 2 * kernel_radius + 1
-    pixel = dr.arange(mi.UInt32, rows * columns)
-    across = dr.opaque(mi.UInt32, columns)
-    y = mi.Int32(pixel // across)
-    x = mi.Int32(pixel) - y * mi.Int32(across)
-    base = pixel * (channels + 1)
-    sums = dr.zeros(mi.Float, rows * columns * (channels + 1)) if earlier is None else earlier
-    # Not a state of the loops, which would be copied.
+    groups = -(-columns // _GROUP)
+    group = dr.arange(mi.UInt32, rows * groups)
+    across = dr.opaque(mi.UInt32, groups)
+    row = group // across
+    y, x = mi.Int32(row), mi.Int32((group - row * across) * _GROUP)
+    base = row * (channels * across) + group  # of its first channel, in groups
+    sums = dr.zeros(mi.Float, rows * groups * _GROUP * (channels + 1)) if earlier is None else earlier
+    # Not a state of the loops, which would be copied. Four neighbours are added at once.
     add = functools.partial(dr.scatter_reduce, dr.ReduceOp.Add, sums, mode=dr.ReduceMode.NoConflicts)
-    stride = mi.Int32(across) + 2 * sides
-    last_x, first_y, last_y = mi.Int32(across) + sides, dr.opaque(mi.Int32, -above), dr.opaque(mi.Int32, rows + below)
+    inner = dr.opaque(mi.Int32, columns)
+    stride, last_x = inner + 2 * sides, inner + sides
+    first_y, last_y = dr.opaque(mi.Int32, -above), dr.opaque(mi.Int32, rows + below)
 
-    weight = dr.zeros(mi.Float, rows * columns)
+    weight = dr.zeros(mi.Vector4f, rows * groups)
+    width = 2 * kernel_radius + _GROUP
     tap = mi.UInt32(0)
-    while tap < width * width:
+    while tap < width * (2 * kernel_radius + 1):
         source_y = y + mi.Int32(tap // width) - kernel_radius
         source_x = x + mi.Int32(tap % width) - kernel_radius
         inside = (source_x >= -sides) & (source_y >= first_y) & (source_x < last_x) & (source_y < last_y)
         index, end = samples(mi.UInt32((source_y - first_y) * stride + source_x + sides), inside)
         while index < end:
-            filter_weight = mi.Float(1)
+            filter_weight = mi.Vector4f([dr.select(source_x == x + k, mi.Float(1), 0) for k in range(_GROUP)])
             if dr.hint(not box, mode="scalar"):
                 offset_x = mi.Float(x) + 0.5 - dr.gather(mi.Float, position.x, index, inside)
                 offset_y = mi.Float(y) + 0.5 - dr.gather(mi.Float, position.y, index, inside)
-                filter_weight = rfilter.eval(offset_x, inside) * rfilter.eval(offset_y, inside)
+                of_row = rfilter.eval(offset_y, inside)
+                filter_weight = mi.Vector4f([rfilter.eval(offset_x + k, inside) * of_row for k in range(_GROUP)])
             for i in range(len(channel)):
                 fractional = dr.gather(mi.Float, channel[i], index, inside)
                 weighted = dr.gather(mi.Float, value[i], index, inside) * filter_weight
@@ -432,9 +435,19 @@ def collect(
                 k = mi.Int32(lower)
                 for target, part in ((k, weighted * (1 - upper_weight)), (k + 1, weighted * upper_weight)):
                     exists = inside & (target >= 0) & (target < channels)
-                    add(part, base + mi.UInt32(target), exists)
+                    add(part, base + mi.UInt32(target) * across, exists)
             weight += dr.select(inside, filter_weight, 0)
             index += 1
         tap += 1
-    dr.scatter(sums, weight, base + channels)
+    dr.scatter(sums, weight, base + channels * across)
     return sums
+
+
+def unfolded(sums: mi.Float, size: tuple[int, int]) -> NDArray[np.float32]:
+    """Return what `collect` gathered for (rows, columns), in the memory of Dr.Jit, without a copy.
+
+    The shape is (rows, columns, channels + 1); the last are the sums of filter weights.
+    """
+    rows, columns = size
+    by_channel = np.asarray(sums).reshape(rows, -1, -(-columns // _GROUP) * _GROUP)
+    return np.moveaxis(by_channel[..., :columns], 1, 2)

@@ -25,7 +25,16 @@ from ...render.scene import recorded_range
 from ...render.scene_file import SceneFile
 from ...render.spectral_film import channel_wavelengths
 from ...render.sums import Accumulation, ratio
-from ...render.trace_pass import check_memory, collect, equal_ranges, pass_seed, rotated_sampler, sampler_of, trace_pass
+from ...render.trace_pass import (
+    check_memory,
+    collect,
+    equal_ranges,
+    pass_seed,
+    rotated_sampler,
+    sampler_of,
+    trace_pass,
+    unfolded,
+)
 from ...settings import VISIBLE
 from .. import tristimulus
 from ..diffraction_shader import PUBLISHED_BRIGHTNESS, checked_brightness, parameters_of_variant
@@ -408,7 +417,7 @@ class Pictures:
         rfilter = self.scene.sensors()[0].film().rfilter()
         count = dr.opaque(mi.UInt32, len(x) // (rows * columns))
         sums = collect(rfilter, mi.Point2f(x, y), channels, rgb, (rows, columns), (0, 0, 0), equal_ranges(count), 3)
-        values = np.array(sums, np.float64).reshape(rows, columns, 4)
+        values = unfolded(sums, (rows, columns)).astype(np.float64)
         return ratio(values[..., :3], values[..., 3:])
 
     def _shade(self, colour: ColourOfRay, first: int, count: int, samples: int, half: int) -> NDArray[np.float32]:
