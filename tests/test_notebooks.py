@@ -3,9 +3,12 @@
 A code cell may carry the metadata "reduced", Python source that the test runs in its place: the same with less work.
 """
 
+import ast
 import base64
 import copy
 import os
+import subprocess
+import sys
 from pathlib import Path
 
 import nbformat
@@ -83,6 +86,19 @@ def test_a_notebook_runs(path):
     notebook = executed(reduced(nbformat.read(path, as_version=4)))
     assert not [out for out in outputs(notebook) if out.output_type == "error"]
     assert pictures(notebook)
+
+
+def test_what_the_notebooks_import_exists():
+    # Reduced cells leave out what takes long: functions that are gone would be missed.
+    def imports(notebook):
+        for statement in ast.parse("\n".join(cell.source for cell in code_cells(notebook))).body:
+            text = ast.unparse(statement)
+            if isinstance(statement, ast.Import | ast.ImportFrom) or text.startswith("sys.path.insert("):
+                yield text
+
+    lines = [line for path in NOTEBOOKS for line in imports(nbformat.read(path, as_version=4))]
+    assert any("measured_figures" in line for line in lines)
+    subprocess.run([sys.executable, "-c", "\n".join(lines)], cwd=FOLDER, check=True)
 
 
 def test_the_reduced_source_of_a_cell_is_run_instead_and_an_error_is_noticed():
