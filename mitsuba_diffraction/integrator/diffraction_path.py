@@ -46,11 +46,12 @@ pinhole. In L G X G E and L G X M E, half of the directions from an opaque X are
 balance heuristic.
 
 A path from the light starts at a point on a grating, drawn by area, and a light drawn for that point. One of four such
-pairs is chosen with a probability proportional to the radiance that it receives, shadows included. The path is
-continued by `sample` of the BSDFs, with the correction for shading normals and for BSDFs that are not reciprocal; each
-X is connected to the sensor. There is one path from the light for 2 samples of the film, where a pilot finds much of
-this light in the picture, to 64, where it finds little; the number depends on the scene alone. As in `path`, a light
-without extent is not seen in a mirror: it is omitted where the grating next to it scatters by a delta component.
+pairs is chosen with a probability proportional to the radiance that it receives, shadows included. Four paths are
+continued from there by `sample` of the BSDFs, with the correction for shading normals and for BSDFs that are not
+reciprocal; each X is connected to the sensor. There is one path from the light for 2 samples of the film, where a pilot
+finds much of this light in the picture, to 64, where it finds little; the number depends on the scene alone. As in
+`path`, a light without extent is not seen in a mirror: it is omitted where the grating next to it scatters by a delta
+component.
 
 Without a grating, with max_depth of 0 or 1, in polarised variants, and for sensors other than `perspective` and
 `thinlens`, this is `path`. So it is with max_depth of 2 where lights have no extent, or are about as bright in all

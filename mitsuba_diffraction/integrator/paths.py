@@ -298,7 +298,8 @@ def unpacked(splats: NDArray[np.float32]) -> tuple[mi.Point2f, mi.Spectrum, mi.S
     return mi.Point2f(x, y), mi.Spectrum(rest[:half]), mi.Spectrum(rest[half:])
 
 
-_MAX_PATHS_PER_LAUNCH = 2**20  # some 150 MB
+_MAX_STARTS_PER_LAUNCH = 2**18  # some 150 MB
+_BRANCHES = 4  # paths of each start
 _NUM_CANDIDATES = 4  # of the first grating vertex and light direction
 _MIN_LIGHT_PATHS, _MAX_LIGHT_PATHS = -6, -1  # log₂ r, see below
 _PILOT_PATHS, _LIGHTS_AT_POINT, _PILOT_SEED = 2**13, 16, 0x50494C4F
@@ -320,11 +321,13 @@ class LightPaths:
 
     y₁ and ω₁ are one of four candidates, chosen with a probability proportional to the radiance received, shadows
     included (resampling, Talbot 2005). Even where a grating is mostly in shadow, most paths then begin at a lit point.
+    Finding it takes as long as tracing a path. Thus each start has four paths, between which the first random number of
+    `sample` at y₁ is stratified: each of the four wavelengths usually has a direction of its own.
 
     There are r paths for each sample of the film. Relative to the square of radiance, they add a variance of V/r to
     that of a sample, V_e, and take 2 r times as long, or so. r = √(V/(2 V_e)) minimises variance × time. V_e is taken
     as 1/2, and r is rounded to a power of two from 1/64 to 1/2. V is that of a pilot of other paths, and radiance the
-    median of direct light over the film, plus the mean of the pilot. Thus r depends on the scene alone.
+    mean of direct light over the film, plus that of the pilot. Thus r depends on the scene alone.
     """
 
     def __init__(self, scene: mi.Scene, sensor: mi.Sensor, gratings: Gratings, max_depth: int, rr_depth: int) -> None:
@@ -333,6 +336,7 @@ class LightPaths:
         self.max_depth = dr.opaque(mi.UInt32, max_depth % 2**32)
         self.pixels = math.prod(map(int, sensor.film().crop_size()))
         self.rr_depth = dr.opaque(mi.UInt32, rr_depth)
+        self._capacity = float(_BRANCHES)  # contributions that a buffer takes, per start
         self.per_sample = self._number_per_sample()
 
     def count(self, spp: int) -> int:
@@ -344,7 +348,7 @@ class LightPaths:
         splats = [*self.splats(_PILOT_SEED, _PILOT_PATHS), np.zeros((1, 2 + 2 * dr.size_v(mi.Spectrum)), np.float32)]
         # Of a path for each sample.
         values = np.concatenate(splats)[:, -dr.size_v(mi.Spectrum) :].mean(axis=1) * (_PILOT_PATHS / self.pixels)
-        radiance = float(np.nanmedian(self._direct_light())) + values.sum() / _PILOT_PATHS
+        radiance = float(np.nanmean(self._direct_light())) + values.sum() / _PILOT_PATHS
         variance = np.square(values / (radiance or 1)).sum() / _PILOT_PATHS
         exponent = 0.5 * math.log2(variance) if variance > 0 else -math.inf
         return 2.0 ** round(min(max(exponent, _MIN_LIGHT_PATHS), _MAX_LIGHT_PATHS))
@@ -361,57 +365,76 @@ class LightPaths:
         return dr.block_sum(dr.mean(weight * emitted * value) / _LIGHTS_AT_POINT, _LIGHTS_AT_POINT)
 
     def splats(self, seed: mi.UInt32 | int, count: int) -> Iterator[NDArray[np.float32]]:
-        """Trace `count` paths; yield contributions, (n, 10). They and their order depend on seed and count alone.
+        """Trace `count` paths, or up to three more; yield contributions, (n, 10).
+
+        They and their order depend on seed and count alone.
 
         Each is a position x in pixels from the corner of the crop window, four wavelengths in nm, drawn by the sensor,
         and their values: Σ value δ(x − position) has the expectation L(x), in the form in which the sensor gives
         radiance to the film: divided by the density of the wavelengths and times the film's response.
         """
-        capacity = min(_MAX_PATHS_PER_LAUNCH, count)
-        for first in range(0, count, _MAX_PATHS_PER_LAUNCH):
-            paths = min(_MAX_PATHS_PER_LAUNCH, count - first)
-            buffer = SplatBuffer(capacity)
-            self._trace(seed, first, paths, self.pixels / count, buffer)
-            if buffer.count() > capacity:
-                # Repeated with the same random numbers and a larger buffer.
-                capacity = buffer.count()
-                buffer = SplatBuffer(capacity)
-                self._trace(seed, first, paths, self.pixels / count, buffer)
+        starts = -(-count // _BRANCHES)
+        for first in range(0, starts, _MAX_STARTS_PER_LAUNCH):
+            launched = min(_MAX_STARTS_PER_LAUNCH, starts - first)
+            while True:
+                buffer = SplatBuffer(math.ceil(self._capacity * launched))
+                self._trace(seed, first, launched, self.pixels / (starts * _BRANCHES), buffer)
+                if buffer.count() <= buffer.capacity:
+                    break
+                # Repeated with the same random numbers and a larger buffer, which later launches have at once.
+                self._capacity = 1.1 * buffer.count() / launched
             if buffer.count() > 0:
                 yield buffer.content()
 
     @dr.syntax
     def _trace(self, seed: mi.UInt32 | int, first: int, count: int, scale: float, buffer: SplatBuffer) -> None:
-        """Trace the paths from the number `first` on, and add their contributions to the sensor to `buffer`."""
-        path = dr.arange(mi.UInt32, count) + dr.opaque(mi.UInt32, first)
-        rng = random_numbers(seed, 0x9E3779B9, path)
-        ray, power, active = self._start(rng)
+        """Trace the paths of `count` starts from the number `first` on; add their contributions to `buffer`."""
+        start = dr.arange(mi.UInt32, count) + dr.opaque(mi.UInt32, first)
+        rng = random_numbers(seed, 0x9E3779B9, start)
+        first_si, power, delta, active = self._start(rng)
         power *= dr.opaque(mi.Float, scale)
-        si = self.scene.ray_intersect(ray, active)
-        depth = mi.UInt32(2)
-        active &= si.is_valid()
-        throughput = mi.Spectrum(1)
+        si = mi.SurfaceInteraction3f(first_si)
+        branch, depth = mi.UInt32(0), mi.UInt32(1)
+        carried, throughput = mi.Spectrum(power), mi.Spectrum(1)
+        branches = dr.opaque(mi.UInt32, _BRANCHES)
         while active:
-            bsdf = si.bsdf(ray)
+            bsdf = si.bsdf()
             on_grating, grating_only = self.gratings.classify(si, active)
-            on_other = active & (on_grating ^ True)
-            position, value, connected = self._connect(si, bsdf, _next_2d(rng), on_other)
-            buffer.add((*position, *ray.wavelengths, *(value * power * throughput)), path, depth, connected)
-            ray, weight, _ = self._scatter(si, bsdf, power * throughput, grating_only, rng, active)
-            throughput *= weight
+            position, value, connected = self._connect(si, bsdf, _next_2d(rng), active & (on_grating ^ True))
+            splat = (*position, *si.wavelengths, *(value * carried))
+            buffer.add(splat, start * branches + branch, depth, connected)
+            at_start = depth == 1
+            u = _next_1d(rng)
+            u = dr.select(at_start, (mi.Float(branch) + u) / mi.Float(branches), u)
+            ray, weight, specular = self._scatter(si, bsdf, carried, grating_only, u, _next_2d(rng), active)
+            carried *= weight
+            # That of the grating is not part of it.
+            throughput = dr.select(at_start, 1, throughput * weight)
+            # `path` does not find a light without extent by specular reflection.
+            goes_on = dr.any(carried != 0) & ((at_start & specular & delta) ^ True)
             depth += 1
             roulette = depth >= self.rr_depth
             # As in `path`, but without η²: refraction scales radiance, not power.
             survival = dr.minimum(dr.max(throughput), 0.95)
-            active &= dr.any(throughput != 0) & (depth < self.max_depth)
-            active &= (roulette ^ True) | (_next_1d(rng) < survival)
-            throughput *= dr.select(roulette, quotient(1, survival), 1)
-            si = self.scene.ray_intersect(ray, active)
-            active &= si.is_valid()
+            goes_on &= (depth < self.max_depth) & ((roulette ^ True) | (_next_1d(rng) < survival))
+            factor = dr.select(roulette, quotient(1, survival), 1)
+            carried *= factor
+            throughput *= factor
+            next_si = self.scene.ray_intersect(ray, active & goes_on)
+            goes_on &= next_si.is_valid()
+            # Where a path ends, the next branch begins.
+            si = dr.select(goes_on, next_si, first_si)
+            carried = dr.select(goes_on, carried, power)
+            depth = dr.select(goes_on, depth, 1)
+            branch = dr.select(goes_on, branch, branch + 1)
+            active &= branch < branches
 
     @dr.syntax
-    def _start(self, rng: mi.PCG32) -> tuple[mi.Ray3f, mi.Spectrum, mi.Bool]:
-        """Sample a path from a light to a grating: return the scattered ray, its power, and whether it is valid."""
+    def _start(self, rng: mi.PCG32) -> tuple[mi.SurfaceInteraction3f, mi.Spectrum, mi.Bool, mi.Bool]:
+        """Sample a light and a point on a grating, whose `wi` points to it.
+
+        Return them, the power T₁, whether the light has no extent, and whether the sample is valid.
+        """
         time = mi.Float(self.sensor.shutter_open())
         if dr.hint(self.sensor.shutter_open_time() > 0, mode="scalar"):
             time += _next_1d(rng) * self.sensor.shutter_open_time()
@@ -446,15 +469,9 @@ class LightPaths:
         ray = mi.Ray3f(point + normal * offset, -normal, 2 * offset, time, wavelengths)
         si = self.scene.ray_intersect(ray, total_weight > 0)
         active = si.is_valid()
-        on_grating, grating_only = self.gratings.classify(si, active)
-        active &= on_grating
         si.wi = si.to_local(direction)
         power *= dr.abs(dr.dot(direction, si.n))
-        ray, weight, specular = self._scatter(si, si.bsdf(), power, grating_only, rng, active)
-        power *= weight
-        # `path` does not find a light without extent by specular reflection.
-        active &= dr.any(power != 0) & ((specular & delta) ^ True)
-        return ray, power, active
+        return si, power, delta, active & self.gratings.classify(si, active)[0]
 
     def _scatter(
         self,
@@ -462,13 +479,14 @@ class LightPaths:
         bsdf: mi.BSDF,
         power: mi.Spectrum,
         reciprocal: mi.Bool,
-        rng: mi.PCG32,
+        u: mi.Float,
+        v: mi.Point2f,
         active: mi.Bool,
     ) -> tuple[mi.Ray3f, mi.Spectrum, mi.Bool]:
         """Sample the next ray; return it, T_{j+1}/T_j, and whether the scattering was specular."""
         ctx = mi.BSDFContext(mi.TransportMode.Importance)
         si_bsdf = with_surviving_wavelengths(si, power, reciprocal)
-        bs, weight = bsdf.sample(ctx, si_bsdf, _next_1d(rng), _next_2d(rng), active)
+        bs, weight = bsdf.sample(ctx, si_bsdf, u, v, active)
         specular = mi.has_flag(bs.sampled_type, mi.BSDFFlags.Delta)
         ray = si.spawn_ray(si.to_world(bs.wo))
         # |cos θ_j/cos θ'_j|, to the normal that reflects or refracts ω_j into ω'_j; one if the direction is unchanged.

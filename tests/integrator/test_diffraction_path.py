@@ -10,7 +10,7 @@ import pytest
 from bsdf_support import bitmap, grating, uniform, use
 
 import mitsuba_diffraction  # noqa: F401 (settles which LLVM is used before a variant is set)
-from mitsuba_diffraction.integrator.paths import LightPaths
+from mitsuba_diffraction.integrator.paths import LightPaths, SplatBuffer
 from mitsuba_diffraction.render import scene_file
 from mitsuba_diffraction.render.scene_file import SceneFile
 from mitsuba_diffraction.render.spectral_film import channel_weights
@@ -268,9 +268,40 @@ def test_light_paths_begin_where_gratings_are_lit(llvm):
     plates = {f"plate{k}": {"type": "rectangle", "to_world": to, "bsdf": blaze()} for k, to in enumerate(transforms)}
     built = scene(roof=roof, sun=SUN, **plates)
     _, light = mi.load_dict({"type": "diffraction_path", "max_depth": 3}).parts(built, built.sensors()[0])
-    _, power, starts = light._start(mi.PCG32(size=2**14))
+    _, power, _, starts = light._start(mi.PCG32(size=2**14))
     assert dr.mean(mi.Float(starts))[0] == pytest.approx(1 - 0.75**4, abs=0.02)
     assert dr.all(dr.any(power != 0) | ~starts)
+
+
+def test_each_wavelength_of_a_start_has_a_path_of_its_own(llvm):
+    """Each direction of a line grating of narrow lobes has one of the four wavelengths."""
+    built = scene(plate=plate(blaze(26.0), 0.5), sun=SUN)
+    _, light = mi.load_dict({"type": "diffraction_path", "max_depth": 3}).parts(built, built.sensors()[0])
+    starts = 1000
+    buffer = SplatBuffer(4 * starts)
+    light._trace(0, 0, starts, 1.0, buffer)
+    path = np.sort(np.array(buffer._path)[: buffer.count()])
+    values = buffer.content()[:, -4:]
+    strongest = np.full((starts, 4), -1)
+    # Not the zeroth order, in which all wavelengths have the same direction.
+    strongest.flat[path] = np.where(values.max(1) > 0.9 * values.sum(1), values.argmax(1), -1)
+    seen = strongest[(strongest >= 0).all(1)]
+    assert len(seen) > 100
+    assert (np.sort(seen, 1) == np.arange(4)).all(1).mean() > 0.5
+
+
+def test_buffers_of_later_launches_are_large_enough_at_once(llvm, monkeypatch):
+    built = scene(plate=plate(blaze(), 0.5), sun=SUN)
+    _, light = mi.load_dict({"type": "diffraction_path", "max_depth": 3}).parts(built, built.sensors()[0])
+    traced = []
+    original = LightPaths._trace
+    monkeypatch.setattr(LightPaths, "_trace", lambda *arguments: traced.append(0) or original(*arguments))
+    light._capacity = 0.1
+    wanted = list(light.splats(1, 4000))
+    assert len(traced) == 2
+    found = list(light.splats(1, 4000))
+    assert len(traced) == 3
+    np.testing.assert_array_equal(found, wanted)
 
 
 def beam_on_a_grating():
