@@ -86,7 +86,7 @@ class Settings:
         foreign = SPECTRUM_PARAMETERS.keys() - {field.name for field in fields(kind)}
         for name in sorted(foreign & given.keys()):
             if (value := given.pop(name)) != SPECTRUM_PARAMETERS[name].default:
-                raise RequestError(f"theory: got {theory} with {name} {value!r}, {kind.refusal}")
+                raise RequestError(f"{name}: got {value!r} with theory {theory!r}, {kind.refusal}")
         return kind(**given)
 
     def __post_init__(self) -> None:

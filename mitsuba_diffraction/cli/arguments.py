@@ -17,6 +17,7 @@ from ..files.writing import refuse_other_than_utf8
 from ..precomputation.recipe import Recipe
 from ..precomputation.surface_text import absolute, parsed
 from ..progress import say
+from ..surface.gratings import PROFILES
 
 _MAX_VALUES = 10_000  # of a range first:last:step
 
@@ -95,6 +96,12 @@ def materials_of(texts: Sequence[str] | None) -> dict[str, dict[str, Any]]:
         if name in materials:
             raise RequestError(f"--material {name}: got it twice, wanted one grating")
         is_file = Path(source).suffix.lower() in (".toml", ".exr")
+        if source not in PROFILES and not is_file:
+            raise RequestError(
+                f"--material {name}: got {source}, wanted a recipe (.toml), a spectrum (.exr) or a profile"
+            )
+        if lists := [key for key, value in values.items() if isinstance(value, list)]:
+            raise RequestError(f"--material {name}: got a list, {lists[0]}, which a recipe has, but no scene")
         if is_file and not os.path.isfile(source):
             raise FileNotFoundError(f"{source}: no such file")
         if is_film(source) and values.keys().isdisjoint(("transmission", "material", "coat_ior", "base")):

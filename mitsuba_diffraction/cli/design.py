@@ -140,7 +140,7 @@ def design(
             seen_on=seen_on,
             unused=unused,
             tool_blur=tool_blur,
-            starts=starts or max(4, round(24 * (_MIN_TEXELS / max(texels, _MIN_TEXELS)) ** 2)),
+            starts=starts if starts is not None else max(4, round(24 * (_MIN_TEXELS / max(texels, _MIN_TEXELS)) ** 2)),
             seed=seed,
             progress=progress,
             expect=functools.partial(_say_effort, note),

@@ -19,11 +19,21 @@ from ..precomputation.surface_text import parsed
 from ..progress import progress_bar, tell
 from ..scalar_theory.validity import scalar_error
 from ..settings import ScalarSettings
-from .arguments import KEYS_OF_RECIPES, SURFACE, Overwrite, angles_of, check_suffix, parse_numbers, recipe_of
+from .arguments import (
+    KEYS_OF_RECIPES,
+    SURFACE,
+    Overwrite,
+    angles_of,
+    check_suffix,
+    named_as_options,
+    parse_numbers,
+    recipe_of,
+)
 
 _OF_LIGHT = ("theory", "transmission", "material", "int_ior")  # besides the surface
 
 
+@named_as_options({"wavelengths": "--wavelength"})
 def efficiency(
     surface: Annotated[
         str,

@@ -20,7 +20,17 @@ from ..precomputation.spectra import load_spectrum
 from ..precomputation.surface_text import parsed
 from ..progress import progress_bar, say, tell
 from ..scalar_theory.validity import scalar_error
-from .arguments import KEYS_OF_RECIPES, SURFACE, Overwrite, angles_of, check_suffix, is_film, parse_numbers, recipe_of
+from .arguments import (
+    KEYS_OF_RECIPES,
+    SURFACE,
+    Overwrite,
+    angles_of,
+    check_suffix,
+    is_film,
+    named_as_options,
+    parse_numbers,
+    recipe_of,
+)
 
 _OF_MATERIAL = ("theory", "material", "int_ior")
 _INPUTS = {"orientation": "Orientation", "height_scale": "HeightScale", "base": "BaseColor"}  # of the shader
@@ -117,7 +127,7 @@ def _write_orders(title: str, recipe: Recipe, parameters: dict[str, Any], output
     wavelengths, angles = parse_numbers("--wavelength", ranges["wavelength"]), angles_of("--angle", ranges["angle"])
     azimuths = parse_numbers("--azimuth", ranges["azimuth"])
     grating = ExportedGrating.of_recipe(recipe, title, parameters, float(wavelengths.min()) * 1e-3)
-    with progress_bar(f"orders of {title}") as progress:
+    with named_as_options({"wavelengths": "--wavelength"}), progress_bar(f"orders of {title}") as progress:
         if suffix == ".csv":
             rows = write_order_table(grating, output, wavelengths, angles, azimuths, progress)
             what = f"{rows:,} rows"

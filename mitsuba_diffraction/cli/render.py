@@ -148,7 +148,7 @@ def render(
     pictures = _pictures(target, frames)
     # By default all pictures have the exposure of the first.
     factor = None if exposure is None else 2**exposure
-    with durations():
+    with durations(), named_as_options({"until_error": "--until-error", "spp": "--spp"}):
         for number, (path, motion) in enumerate(zip(pictures, motions, strict=True)):
             begin = time.perf_counter()
             factor = _picture(

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import functools
 import webbrowser
+from dataclasses import replace
 from pathlib import Path
 from typing import Annotated
 
@@ -11,7 +12,7 @@ import typer
 
 from ..files.outputs import check_outputs
 from ..files.writing import whole_file
-from ..precomputation.surface_text import parsed
+from ..precomputation.surface_text import parsed, written
 from ..progress import bytes_text, progress_bar, say, tell
 from ..viewer.page import page, reference_picture
 from ..viewer.viewed_surface import Surface
@@ -50,6 +51,10 @@ def view(
             say("note", f"{name}: {shown}")
     progress = functools.partial(progress_bar, unit="%")
     surfaces = [Surface.named(name, values, progress) for name, values in requests]
+    stems = [one.name for one in surfaces]
+    for index, (_, values) in enumerate(requests):
+        if values and stems.count(stems[index]) > 1:  # as of two periods, or materials, of one profile
+            surfaces[index] = replace(surfaces[index], name=written(stems[index], values))
     text = page(*surfaces, picture=picture)
     with whole_file(target) as temporary:
         temporary.write_text(text, encoding="utf-8")

@@ -103,7 +103,8 @@ class Plate:
         for name, zero in (("texel", False), ("height_range", False), ("tool_blur", True)):
             value = getattr(self, name)
             if not is_number(value) or value < 0 or (value == 0 and not zero):
-                raise RequestError(f"{name}: got {value!r}, wanted a {'' if zero else 'positive '}number of µm")
+                wanted = "0 µm or more" if zero else "a positive number of µm"
+                raise RequestError(f"{name}: got {value!r}, wanted {wanted}")
         check_whole("texels", self.texels, 4, _MAX_TEXELS)
         if not (is_number(self.angle) and 0 < self.angle < 45):
             raise RequestError(

@@ -184,6 +184,8 @@ class Recipe:
             recipe = cls.of_profile(source, {}, **settings)
         elif path.suffix.lower() == ".toml":
             recipe = cls.load(path, **settings)
+        elif path.suffix.lower() == ".exr" and path.is_file():
+            raise RequestError(f"{source}: got a saved spectrum, wanted the recipe, the profile or the scan")
         else:
             recipe = cls({"scan": path.name}, Settings.of(**{"extent": extent, **settings}), path.parent)
         if unknown := [name for name in given if name not in recipe.known]:

@@ -92,7 +92,7 @@ def build_spectrum(
     if height_range > settings.largest_height_range:
         raise RequestError(
             f"heights: got a range of {height_range:.4g} µm, wanted at most {settings.largest_height_range:g}: are "
-            "these nanometres? If the surface is so deep, raise largest_height_range of `precompute`"
+            "these nanometres? If the surface is so deep, raise largest_height_range"
         )
     if isinstance(settings, ScalarSettings):
         if len(patches) > 1 and settings.representation in SERIES:

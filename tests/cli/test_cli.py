@@ -111,6 +111,9 @@ def files():
         ("render scene.xml -o nowhere/out.exr", "nowhere"),
         ("render scene.xml -D spectrum", "-D: got 'spectrum', wanted NAME=VALUE"),
         ("render scene.xml -D =blaze.toml", "-D: got '=blaze.toml'"),
+        ("render scene.xml --until-error 5", "--until-error: got 5.0, wanted a relative error between 0 and 1"),
+        ("render scene.xml --material a=scan.npy,pixel_size=1", "--material a: got scan.npy, wanted a recipe (.toml)"),
+        ("render scene.xml --material a=blazed,unit=um,unit=nm", "--material a: got a list, unit, which a recipe"),
         ("render scene.xml --spp 0", "--spp"),
         ("render scene.xml --spp many", "--spp"),
         ("render scene.xml --width 0", "--width"),
@@ -153,6 +156,14 @@ def test_a_recipe_that_is_wrong_is_one_line(command, text):
     assert (code, out) == (2, "")
     assert len(err.splitlines()) == 1, err
     assert "\x1b" not in err
+
+
+@pytest.mark.parametrize("name", ["precompute", "inspect"])
+def test_a_saved_spectrum_is_no_surface_of_these_commands(command, name):
+    Path("saved.exr").touch()
+    code, _, err = command(name, "saved.exr")
+    assert code == 2
+    assert "error: saved.exr: got a saved spectrum, wanted the recipe, the profile or the scan" in err
 
 
 def test_a_spectrum_cut_short_is_one_line(command):

@@ -241,6 +241,7 @@ def test_the_command_writes_numbers_and_plot(command, tmp_path, monkeypatch):
         ("efficiency blazed,depth=1,depth=2", "got 'depth=2', wanted name=value, each name once"),
         ("efficiency blazed --angle 0:60", "--angle: got '0:60', wanted a number"),
         ("efficiency blazed --angle 0:60:-5", "--angle: got '0:60:-5', wanted a number"),
+        ("efficiency blazed --wavelength 5", "error: --wavelength: got 5, wanted nm from 10 to 100000"),
         ("efficiency gone.toml", "gone.toml: no such file"),
         ("efficiency blazed --csv e.txt", "--csv: got e.txt, wanted a file name that ends in .csv"),
     ],

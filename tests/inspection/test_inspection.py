@@ -530,6 +530,7 @@ def test_inspect_takes_a_recipe(folder, command):
         ("inspect grey.png,pixel_size=0.1 -o ./grey.png", "which is read"),
         ("inspect foil.toml --angle 30", "--angle: got 30 without --view"),
         ("inspect foil.toml --view 30:", "--view: got '30:', wanted a number"),
+        ("inspect foil.toml,material=Al", "material: got 'Al' with theory 'scalar', wanted none"),
         ("inspect foil.toml --view 10,95", "--view: got 95, wanted degrees above −90 and below 90"),
     ],
 )

@@ -114,8 +114,8 @@ def test_the_command_answers_for_scan_recipe_and_spectrum(command, scan, sinusoi
     ("line", "message"),
     [
         ("saved.exr,pixel_size=1", "saved.exr: got pixel_size with a saved spectrum, wanted the recipe or the scan"),
-        ("scan.toml,theory=rigorous", "theory: got rigorous with extent 'sample', wanted none"),
-        ("scan.npy,pixel_size=1 --wavelength 300", "wavelengths: got 300, wanted nm from 360 to 830"),
+        ("scan.toml,theory=rigorous", "extent: got 'sample' with theory 'rigorous', wanted none"),
+        ("scan.npy,pixel_size=1 --wavelength 300", "--wavelength: got 300, wanted nm from 360 to 830"),
         ("scan.npy,pixel_size=1,material=Alu", "material: got 'Alu'"),
         ("scan.npy,pixel_size=1 --angle 90", "--angle: got 90, wanted degrees above −90 and below 90"),
         ("scan.npy,depth=1,pixel_size=1", "scan.npy: got depth, wanted some of pixel_size, "),

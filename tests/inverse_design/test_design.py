@@ -471,7 +471,7 @@ CENTRE[31:34, 31:34] = 1
         (np.eye(8), {"height_range": 0}, "height_range: got 0, wanted a positive number of µm"),
         (np.eye(8), {"height_range": 800}, "height_range: got 800 µm, .* wanted at most 3.46 µm, 16 wavelengths"),
         (np.eye(8), {"tool_blur": 100}, "tool_blur: got 100 µm, wanted at most an eighth of the period, 3.2 µm"),
-        (np.eye(8), {"tool_blur": -1}, "tool_blur: got -1, wanted a number of µm"),
+        (np.eye(8), {"tool_blur": -1}, "tool_blur: got -1, wanted 0 µm or more"),
         (np.eye(8), {"angle": 50}, "angle: got 50, wanted degrees above 0 and below 45"),
         (np.eye(8), {"wavelengths": 0.532}, "wavelengths: got 0.532, wanted one or several in nm"),
         (np.eye(8), {"wavelengths": []}, r"wavelengths: got \[\], wanted one or several"),

@@ -193,6 +193,7 @@ def test_an_interrupted_command_writes_the_best_so_far(command, monkeypatch, num
             "flag.png --angle 0.5",
             "--texels: got 96 of 0.8 µm with an angle of 0.5°, wanted a period of at least",
         ),
+        ("flag.png --starts 0", "error: --starts: got 0, wanted a whole number of at least 1"),
         ("flag.png --levels 1", "error: --levels: got 1, wanted a whole number of at least 2"),
         ("flag.png --wavelength 0.5", "error: --wavelength: got [0.5], wanted one or several in nm"),
         ("flag.png --height-range 800", "error: --height-range: got 800 µm"),

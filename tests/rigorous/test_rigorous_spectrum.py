@@ -367,7 +367,7 @@ def test_a_build_succeeds_without_a_usable_checkpoint(tmp_path, monkeypatch):
     ("change", "message"),
     [
         ({"tolerance": 0}, "tolerance: got 0"),
-        ({"extent": "sample"}, "got rigorous with extent 'sample'"),
+        ({"extent": "sample"}, "extent: got 'sample' with theory 'rigorous'"),
         ({"int_ior": None}, "wanted one of the two"),
         ({"theory": "exact"}, "theory: got 'exact'"),
         ({"transmission": "glass"}, "transmission: got 'glass', wanted one of none, interface, sheet"),
@@ -376,7 +376,7 @@ def test_a_build_succeeds_without_a_usable_checkpoint(tmp_path, monkeypatch):
             "sheet with material 'Al' and int_ior None, wanted a dielectric",
         ),
         ({"transmission": "interface", "ext_ior": 1.3}, "and ext_ior 1.3, wanted no coat"),
-        ({"theory": "scalar"}, "got scalar with int_ior 1.5, wanted none"),
+        ({"theory": "scalar"}, "int_ior: got 1.5 with theory 'scalar', wanted none"),
         ({"height_field": gratings.crossed(2.0, 0.2, samples=8)}, "rows that differ"),
         ({"height_field": [SURFACE, SURFACE]}, r"theory: got rigorous and 2 patches .*, wanted one, of one row"),
         ({"largest_height_range": 0.04}, r"heights: got a range of 0\.049\d* µm, wanted at most 0\.04"),

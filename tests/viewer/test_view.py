@@ -240,8 +240,12 @@ def test_several_surfaces_are_a_list_in_one_page(command, tmp_path, monkeypatch)
     ]
     assert [data["name"] for data in found] == ["blazed", "lamellar", "scan"]
     assert [data["material"]["material"] for data in found] == ["Al", "", ""]
-    code, _, error = command(f"view {SMALL} {SMALL},material=Al --no-open")
+    code, _, error = command("view blazed blazed --no-open")
     assert (code, error.partition("error: ")[2]) == (2, "surfaces: got blazed, blazed, wanted each name once\n")
+    # Variants of one surface are named by their values.
+    assert command(f"view {SMALL} {SMALL},material=Al --no-open --overwrite")[0] == 0
+    text = Path("surfaces.html").read_text(encoding="utf-8")
+    assert [f'"name":"{name}"' in text for name in (SMALL, f"{SMALL},material=Al")] == [True, True]
 
 
 def test_a_coat_that_a_saved_spectrum_does_not_cover_is_refused(command, tmp_path, monkeypatch):
