@@ -17,9 +17,10 @@ class BuildWithExamples(build_py):
         examples = Path(self.build_lib) / "mitsuba_diffraction" / "examples"
         shutil.rmtree(examples, ignore_errors=True)
         for folder in ("scenes", "precompute"):
-            # What the scenes' scripts and earlier renderings left, what judges figures of the manual, and the word of
-            # the gallery, which is too large; textures of the scenes lie in folders of their own.
-            left = shutil.ignore_patterns("models", "out", "gallery.*", "published", "diffract.*", "__pycache__", ".*")
+            # What the scenes' scripts and earlier renderings left, what judges figures of the manual, and two reliefs
+            # of the gallery, which are too large; textures of the scenes lie in folders of their own.
+            reliefs = ("cat_fine.*", "diffract.*")
+            left = shutil.ignore_patterns("models", "out", "gallery.*", "published", *reliefs, "__pycache__", ".*")
             shutil.copytree(folder, examples / folder, ignore=left)
             for picture in (examples / folder).glob("*.exr"):
                 picture.unlink()

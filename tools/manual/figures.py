@@ -81,7 +81,7 @@ FIGURES = (
     Figure(
         ("word.jpg",),
         """mitsuba-diffraction design precompute/designed/diffract.png -o {out}/word.gsf
-        mitsuba-diffraction render scenes/projection.xml -D plate={out}/word.toml -D room=1.5e-5 --exposure 10.8 \
+        mitsuba-diffraction render scenes/projection.xml -D plate={out}/word.toml --exposure 10.5 \
             --width 1280 --height 720 --spp 24 --denoise -o {out}/word.exr""",
         10,
     ),
