@@ -327,6 +327,8 @@ def _on_channels(film: mi.Film, wavelengths: mi.Spectrum, value: mi.Spectrum) ->
     si.wavelengths = wavelengths
     response = film.sensor_response_function().eval(si)
     radiance = mi.unpolarized_spectrum(value) * dr.select(response > 0, dr.rcp(response), 0)
+    # As in Mitsuba's film, where Dr.Jit leaves NaN out of scattered sums; it does not where it scatters four at once.
+    radiance = dr.select(dr.isnan(radiance), 0, radiance)
     centres = channel_wavelengths(recorded_wavelengths(film))
     step = float(centres[1] - centres[0])
     return list((wavelengths - float(centres[0])) / step), list(radiance / (len(radiance) * step))

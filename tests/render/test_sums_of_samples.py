@@ -5,7 +5,8 @@ import mitsuba as mi
 import numpy as np
 import pytest
 
-from mitsuba_diffraction.render.trace_pass import collect, equal_ranges, unfolded
+from mitsuba_diffraction.render.scene_file import SceneFile
+from mitsuba_diffraction.render.trace_pass import collect, equal_ranges, trace_pass, unfolded
 
 CHANNELS, SAMPLES = 5, 3
 
@@ -38,3 +39,24 @@ def test_samples_are_gathered_with_the_weights_of_the_filter(rfilter, margins, c
     sums = np.einsum("yxs,js,jsc->yxc", weight, value, hats)
     np.testing.assert_allclose(found[..., :-1], 2 * sums, rtol=1e-5, atol=1e-5)
     np.testing.assert_allclose(found[..., -1], weight.sum(-1), rtol=1e-5)
+
+
+def test_samples_without_a_value_count_as_zero(llvm, tmp_path):
+    class Halves(mi.SamplingIntegrator):
+        """One for half of the samples, NaN for the others."""
+
+        def __init__(self):
+            mi.SamplingIntegrator.__init__(self, mi.Properties())
+
+        def sample(self, scene, sampler, ray, medium=None, active=True):
+            return mi.Spectrum(dr.select(sampler.next_1d() < 0.5, 1, np.nan)), mi.Bool(True), []
+
+    film = '<film type="hdrfilm"><integer name="width" value="6"/><integer name="height" value="5"/></film>'
+    path = tmp_path / "scene.xml"
+    path.write_text(
+        f'<scene version="3.0.0"><integrator type="path"/><sensor type="perspective">{film}</sensor></scene>'
+    )
+    sums = trace_pass(SceneFile(path).load(), 64, 0, Halves())
+    radiance = sums[..., :-1].mean(-1) / sums[..., -1]
+    assert np.nanmin(radiance) > 0.3 * np.nanmax(radiance)
+    assert np.isfinite(radiance).all()
