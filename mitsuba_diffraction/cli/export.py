@@ -32,6 +32,7 @@ from .arguments import (
     recipe_of,
 )
 
+_OPTIONS = {"wavelengths": "--wavelength", "azimuths": "--azimuth"}
 _OF_MATERIAL = ("theory", "material", "int_ior")
 _INPUTS = {"orientation": "Orientation", "height_scale": "HeightScale", "base": "BaseColor"}  # of the shader
 _IN_SCENES = ("coat_ior", "thin_film_ior", "thin_film_thickness", "transmission", "ext_ior", "lateral_scale", *_INPUTS)
@@ -127,7 +128,7 @@ def _write_orders(title: str, recipe: Recipe, parameters: dict[str, Any], output
     wavelengths, angles = parse_numbers("--wavelength", ranges["wavelength"]), angles_of("--angle", ranges["angle"])
     azimuths = parse_numbers("--azimuth", ranges["azimuth"])
     grating = ExportedGrating.of_recipe(recipe, title, parameters, float(wavelengths.min()) * 1e-3)
-    with named_as_options({"wavelengths": "--wavelength"}), progress_bar(f"orders of {title}") as progress:
+    with named_as_options(_OPTIONS), progress_bar(f"orders of {title}") as progress:
         if suffix == ".csv":
             rows = write_order_table(grating, output, wavelengths, angles, azimuths, progress)
             what = f"{rows:,} rows"

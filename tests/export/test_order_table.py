@@ -186,7 +186,7 @@ def test_the_command_writes_a_table(command, tmp_path, monkeypatch):
         ("export blazed,material=Unobtainium -o t.csv", "Unobtainium"),
         ("export blazed,deepth=1 -o t.csv", "blazed: got deepth, wanted some of"),
         ("export blazed --angle 95 -o t.csv", "--angle: got 95, wanted degrees above −90 and below 90"),
-        ("export blazed --azimuth 400 -o t.csv", "azimuths: got 400, wanted degrees from −360 to 360"),
+        ("export blazed --azimuth 400 -o t.csv", "--azimuth: got 400, wanted degrees from −360 to 360"),
         ("export blazed --wavelength 5 -o t.csv", "--wavelength: got 5, wanted nm from 10 to"),
         ("export gone.exr -o t.csv", "gone.exr: got a saved spectrum for t.csv, wanted the recipe, the profile"),
         ("export gone.toml -o t.csv", "gone.toml: no such file"),

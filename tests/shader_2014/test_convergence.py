@@ -98,6 +98,8 @@ def test_the_command_writes_a_plot_and_numbers(command, llvm, tmp_path, monkeypa
         ("", "unused parameters: - $tolerance"),
         ("--tolerance -1", "tolerance: got -1, wanted at least 3e-05: the reference uses a third of the lowest"),
         ("--tolerance 0.1 --tolerance 2e-5", "tolerance: got 2e-05, wanted at least 3e-05"),
+        ("--tolerance 0.1,2e-5", "tolerance: got 2e-05, wanted at least 3e-05"),
+        ("--tolerance fine", "--tolerance: got 'fine', wanted a number"),
         ("-o plot.pdf", "-o: got plot.pdf, wanted a file name that ends in .png"),
         ("--spp 0", "--spp"),
         ("--width 8 --width 9", "--width: got it twice, wanted one value"),

@@ -22,7 +22,9 @@ if TYPE_CHECKING:
 def convergence(
     scene: Annotated[Path, typer.Argument(metavar="SCENE.xml")],
     plot: Annotated[Path, typer.Option("-o", "--output", help="plot of error against time (.png)")],
-    tolerance: Annotated[list[float] | None, typer.Option(help="of the spectra; default: 0.1, 0.01 and 0.001")] = None,
+    tolerance: Annotated[
+        list[str] | None, typer.Option(help="of the spectra, one or several: 0.1,0.01; default: 0.1,0.01,0.001")
+    ] = None,
     terms: Annotated[
         str | None, typer.Option(help="compare numbers of terms of a series, 4,6,8, with slices instead")
     ] = None,
@@ -51,7 +53,8 @@ def convergence(
 
     parameters = scene_parameters(define)
     if terms is None:
-        tolerances = sorted(tolerance or study.PICTURE_TOLERANCES, reverse=True)
+        given = [value for text in tolerance or [] for value in parse_numbers("--tolerance", text).tolist()]
+        tolerances = sorted(given or study.PICTURE_TOLERANCES, reverse=True)
         study.check_tolerances(tolerances)
         own = {"tolerance": f"{tolerances[0]:g}"}
     elif tolerance or reference_spp or len(spp or []) > 1:
