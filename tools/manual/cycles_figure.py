@@ -16,6 +16,8 @@ from mitsuba_diffraction.files.outputs import png_text
 from mitsuba_diffraction.optics.color import into_gamut, neutral_view
 
 SIZE, RADIUS, EXPOSURE = 160, 0.15, 1.0
+PANEL, GAP = 318, 3
+ZOOM = {"plane": 3, "disc": 3, "sphere": 6}
 PANELS = (
     ("plane", "foil", {"coherence_length": 20.0}),
     ("disc", "blazed", {"period": 1.6, "depth": 0.12, "coherence_length": 20.0}),
@@ -55,16 +57,25 @@ def path_traced(shape, profile, parameters):
     return np.array(mi.render(mi.load_dict(scene), spp=256))
 
 
+def centre(picture, zoom):
+    """The middle of a picture, as large as a panel."""
+    first, side = (SIZE - PANEL // zoom) // 2, PANEL // zoom
+    box = (first, first, first + side, first + side)
+    return picture.crop(box).resize((PANEL, PANEL), Image.Resampling.NEAREST)
+
+
 def main(out):
     rows = [[], []]
     with tempfile.TemporaryDirectory() as folder:
         for panel in PANELS:
             rows[0].append(in_cycles(Path(folder), *panel))
             rows[1].append(path_traced(*panel))
-    linear = np.concatenate([np.concatenate(row, axis=1) for row in rows])
-    shown = neutral_view(into_gamut(EXPOSURE * linear))
-    picture = Image.fromarray(np.uint8(np.round(255 * shown)))
-    picture.resize((960, 640), Image.Resampling.NEAREST).save(out, optimize=True, pnginfo=png_text())
+    sheet = Image.new("RGB", (3 * PANEL + 2 * GAP, 2 * PANEL + GAP), "#808080")
+    for line, row in enumerate(rows):
+        for column, linear in enumerate(row):
+            shown = Image.fromarray(np.uint8(np.round(255 * neutral_view(into_gamut(EXPOSURE * linear)))))
+            sheet.paste(centre(shown, ZOOM[PANELS[column][0]]), (column * (PANEL + GAP), line * (PANEL + GAP)))
+    sheet.save(out, optimize=True, pnginfo=png_text())
 
 
 if __name__ == "__main__":
