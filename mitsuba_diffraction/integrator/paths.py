@@ -248,7 +248,9 @@ def _is_smooth_reflector(bsdf: mi.BSDF) -> mi.Bool:
 
 
 def _power_heuristic(a: mi.Float, b: mi.Float) -> mi.Float:
-    return quotient(dr.square(a), dr.square(a) + dr.square(b))
+    """Return the weight; zero, as in `path`, where a is infinite, as for a lamp at grazing incidence."""
+    weight = dr.square(a) / (dr.square(a) + dr.square(b))
+    return dr.select(dr.isfinite(weight), weight, 0)
 
 
 # ---------------------------------------------------------------- from the light

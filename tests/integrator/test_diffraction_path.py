@@ -10,7 +10,7 @@ import pytest
 from bsdf_support import bitmap, grating, uniform, use
 
 import mitsuba_diffraction  # noqa: F401 (settles which LLVM is used before a variant is set)
-from mitsuba_diffraction.integrator.paths import LightPaths, SplatBuffer
+from mitsuba_diffraction.integrator.paths import LightPaths, SplatBuffer, _power_heuristic
 from mitsuba_diffraction.render import scene_file
 from mitsuba_diffraction.render.scene_file import SceneFile
 from mitsuba_diffraction.render.spectral_film import channel_weights
@@ -288,6 +288,11 @@ def test_each_wavelength_of_a_start_has_a_path_of_its_own(llvm):
     seen = strongest[(strongest >= 0).all(1)]
     assert len(seen) > 100
     assert (np.sort(seen, 1) == np.arange(4)).all(1).mean() > 0.5
+
+
+def test_an_infinite_density_has_the_weight_zero(llvm):
+    """The square of that of a lamp at grazing incidence overflows."""
+    assert dr.all(_power_heuristic(mi.Float([1e30, np.inf]), mi.Float(1)) == 0)
 
 
 def test_buffers_of_later_launches_are_large_enough_at_once(llvm, monkeypatch):
