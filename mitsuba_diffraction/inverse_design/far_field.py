@@ -6,6 +6,7 @@ P = A_y η A_xᵀ                               power in each bin of direction c
 L_λ = Σ (P − t)²/s                           t the wanted fraction of the light, Σ over bins
 s = max Σ t²                                 over the wavelengths: unwanted light counts as much at each of them
 L = (mean L_λ³)^⅓                            over the wavelengths: the larger ones count more
+L_c + L/10                                   instead, if there are colours to keep (`ColourDistance`)
 
 ∂L/∂P = (L_λ/L)²/w · 2 (P − t)/s,   ∂L/∂η = g = A_yᵀ ∂L/∂P A_x,   w the number of wavelengths
 ∂L/∂z = 2 Re[conj(iκ e^{iκz}) · ifft2(g F)],   ∂L/∂h = Uᵀ ∂L/∂z U
@@ -22,6 +23,9 @@ from scipy.special import ndtr
 
 from ..array_types import Real
 from ..settings import lobe_width
+from .colour_distance import ColourDistance
+
+_LIGHT_BESIDE_COLOURS = 0.1  # weight of L beside L_c
 
 
 def blurred_texels(texels: int, per_texel: int, blur: float) -> Real:
@@ -66,12 +70,14 @@ class FarField:
         lobes: A of each wavelength, (w, bins, pixels), orders as in `scipy.fft.fftfreq`, the same along x and y. Its
             precision determines the precision of the FFTs.
         wanted: t, (w, bins, bins), rows ↔ +y; sums to one at most for each wavelength.
+        colours: L_c, of a picture whose colours are to be kept.
     """
 
     texels: Real
     kappa: Real
     lobes: Real
     wanted: Real
+    colours: ColourDistance | None = None
 
     def relief(self, heights: Real) -> Real:
         """Return z, (pixels, pixels) µm, of the heights h of the texels, rows ↔ +y."""
@@ -84,12 +90,17 @@ class FarField:
         phase = kappa * self.relief(heights).astype(dtype)
         wave = np.cos(phase) + 1j * np.sin(phase)
         amplitudes = scipy.fft.fft2(wave, norm="forward")
-        difference = self.lobes @ (amplitudes.real**2 + amplitudes.imag**2) @ transposed - self.wanted
+        predicted = self.lobes @ (amplitudes.real**2 + amplitudes.imag**2) @ transposed
+        difference = predicted - self.wanted
         scale = (self.wanted**2).sum(axis=(1, 2)).max()
         of_wavelengths = (difference**2).sum(axis=(1, 2)) / scale
         value = float(np.cbrt((of_wavelengths**3).mean()))
         weight = (of_wavelengths / value) ** 2 / len(of_wavelengths)
         of_predicted = weight[:, None, None] * (2 * difference / scale)
+        if self.colours is not None:
+            of_colours, gradient_of_colours = self.colours(predicted)
+            value = of_colours + _LIGHT_BESIDE_COLOURS * value
+            of_predicted = gradient_of_colours + _LIGHT_BESIDE_COLOURS * of_predicted
         g = transposed @ of_predicted.astype(dtype) @ self.lobes
         back = scipy.fft.ifft2(g * amplitudes)
         gradient = (2 * kappa * (wave.real * back.imag - wave.imag * back.real)).sum(axis=0)

@@ -18,6 +18,7 @@ from ..settings import lobe_width
 from ..surface.heightfield import HeightField
 from .far_field import lobes_in_bins
 from .plate import Plate
+from .target import is_coloured
 
 _PIXEL = 1 / 4  # of the shortest wavelength, at most: resolves all frequencies that light reaches
 _BYTES_PER_PIXEL = 620  # of the relief: as measured, of plates of 64 and of 256 texels
@@ -98,7 +99,7 @@ class Design:
     @property
     def coloured(self) -> bool:
         """Whether wavelengths have different targets."""
-        return bool(np.ptp(self.wanted, axis=0).max() > 1e-6 * self.wanted.max())
+        return is_coloured(self.wanted)
 
     @property
     def contrast(self) -> float:

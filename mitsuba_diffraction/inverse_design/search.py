@@ -17,10 +17,11 @@ from ..errors import RequestError, check_whole
 from ..progress import Progress, bytes_text, silent
 from ..rigorous.solver import one_thread
 from ..settings import MIN_WAVELENGTH, available_memory
+from .colour_distance import ColourDistance
 from .far_field import FarField, lobes_in_bins, nearest_levels
 from .plate import Plate
 from .result import Design, memory_of_prediction
-from .target import wanted_fractions, with_unused
+from .target import is_coloured, wanted_fractions, with_unused
 
 WHITE = 1e3 / np.linspace(1e3 / 430, 1e3 / 670, 8)  # nm, equidistant in 1/λ
 _COARSE, _FINE = 3, 6  # pixels along a texel: of the first searches, and of the last
@@ -55,7 +56,8 @@ def design(
 
     The relief is periodic, a square of `texels` × `texels` of constant height, blurred by the tool. Its heights
     minimise the squared difference between the light in each direction and the wanted fraction, averaged over the
-    wavelengths with more weight on the larger (`FarField`), by L-BFGS-B (Byrd et al. 1995) from the best of several
+    wavelengths with more weight on the larger (`FarField`), and of a coloured picture that of the colours seen, hue
+    before lightness (`ColourDistance`), by L-BFGS-B (Byrd et al. 1995) from the best of several
     random reliefs. The coherence length is half the period, so that the orders merge into a picture.
 
     Args:
@@ -150,7 +152,10 @@ def far_field_of(
     pixels, edges = plate.texels * per_texel, plate.edges(wanted.shape[1])
     orders = scipy.fft.fftfreq(pixels, 1 / pixels)
     lobes = [lobes_in_bins(edges, orders, plate.period, w * 1e-3, coherence_length) for w in plate.wavelengths]
-    return FarField(plate.spread(per_texel), plate.kappa, np.array(lobes, dtype), wanted.astype(dtype))
+    # Light that colours cannot use has their complement, in the mirror direction.
+    keeps_colours = plate.unused == "outside" and np.ptp(plate.wavelengths) >= 2 and is_coloured(wanted)
+    colours = ColourDistance.of(wanted, plate.wavelengths) if keeps_colours else None
+    return FarField(plate.spread(per_texel), plate.kappa, np.array(lobes, dtype), wanted.astype(dtype), colours)
 
 
 def _seconds(far_field: FarField, heights: Real) -> float:

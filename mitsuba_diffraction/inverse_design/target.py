@@ -63,6 +63,11 @@ def wanted_fractions(target: ArrayLike, plate: Plate) -> Real:
     return wanted
 
 
+def is_coloured(wanted: Real) -> bool:
+    """Return whether wavelengths have different targets."""
+    return bool(np.ptp(wanted, axis=0).max() > 1e-6 * wanted.max())
+
+
 def with_unused(wanted: Real, plate: Plate) -> Real:
     """Return t with the light that the colours leave unused in the lobe of order 0, if the plate wants it there."""
     if plate.unused != "mirror":

@@ -116,7 +116,7 @@ def _remedy(design: Design, strokes: float | None, inverted: bool, names: Mappin
         )
     if plate.tool_blur > plate.texel:
         return f"the tool is too blunt: {named('tool_blur')} of at most a texel, {plate.texel:.2g} µm"
-    if design.inside.mean() > _MAX_LIT:
+    if design.inside.mean() > _MAX_LIT and not design.coloured:
         negative = names.get("negative", "its negative")
         cast = (
             f"without {negative}, its other parts are cast" if inverted else f"{negative} casts its dark parts instead"

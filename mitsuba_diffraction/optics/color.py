@@ -223,15 +223,21 @@ def upsampled(rgb: NDArray[np.floating], matrix: NDArray[np.floating]) -> NDArra
     return spectra_of(c)[index].reshape(*np.shape(rgb)[:-1], len(matrix))
 
 
-_SRGB_TO_LMS = np.array(
+SRGB_TO_LMS = np.array(
     [
         [0.4122214708, 0.5363325363, 0.0514459929],
         [0.2119034982, 0.6806995451, 0.1073969566],
         [0.0883024619, 0.2817188376, 0.6299787005],
     ]
 )
-_LMS_TO_SRGB = np.linalg.inv(_SRGB_TO_LMS)
-_LIGHTNESS = np.array([0.2104542553, 0.7936177850, -0.0040720468])  # of Oklab, from the cube roots of LMS
+_LMS_TO_SRGB = np.linalg.inv(SRGB_TO_LMS)
+LMS_TO_OKLAB = np.array(  # of their cube roots
+    [
+        [0.2104542553, 0.7936177850, -0.0040720468],
+        [1.9779984951, -2.4285922050, 0.4505937099],
+        [0.0259040371, 0.7827717662, -0.8086757660],
+    ]
+)
 _SHOULDER_START = 0.8
 _ROUNDNESS = 0.3
 _BISECTIONS = 20
@@ -239,8 +245,8 @@ _BISECTIONS = 20
 
 def _with_chroma(rgb: NDArray[np.floating], factor: float | NDArray[np.floating]) -> NDArray[np.float64]:
     """Multiply the chroma of Oklab by factors (..., 1), at constant hue and lightness; linear sRGB, (..., 3)."""
-    root = np.cbrt(rgb @ _SRGB_TO_LMS.T)
-    grey = (root @ _LIGHTNESS)[..., None]  # in Oklab, the three roots of a grey are its lightness
+    root = np.cbrt(rgb @ SRGB_TO_LMS.T)
+    grey = (root @ LMS_TO_OKLAB[0])[..., None]  # in Oklab, the three roots of a grey are its lightness
     return (grey + factor * (root - grey)) ** 3 @ _LMS_TO_SRGB.T
 
 

@@ -312,6 +312,18 @@ def test_the_target_has_the_colours_of_the_picture_and_the_prediction_those_of_i
     assert design.colour_difference > 5
 
 
+def test_the_search_keeps_hues():
+    """Where the light of each wavelength counts alike, red is beige, 1.5 times as bright in red as in blue light."""
+    picture = np.full((24, 24, 3), (0.8, 0.1, 0.05))
+    picture[:, 12:] = 0.05, 0.15, 0.8
+    design = md.design(picture, texels=12, starts=2, height_range=3.2)
+    _, predicted = design.seen
+    left, right = (half.mean(axis=(0, 1)) for half in np.array_split(predicted, 2, axis=1))
+    assert left[0] > 3.5 * left[2]
+    assert right[2] > 5 * right[0]
+    assert design.colour_difference < 22
+
+
 @pytest.mark.few(2)
 @pytest.mark.parametrize(
     ("options", "words"),

@@ -2,15 +2,18 @@
 
 import itertools
 
+import colour
 import numpy as np
 import pytest
 import scipy.integrate
 import scipy.ndimage
 
+from mitsuba_diffraction.inverse_design.colour_distance import ColourDistance
 from mitsuba_diffraction.inverse_design.far_field import blurred_texels, lobes_in_bins, nearest_levels
 from mitsuba_diffraction.inverse_design.plate import Plate, depth_for_strokes, for_detail
 from mitsuba_diffraction.inverse_design.search import far_field_of
 from mitsuba_diffraction.inverse_design.target import wanted_fractions, with_unused
+from mitsuba_diffraction.optics.color import lamp_to_linear_sRGB
 from mitsuba_diffraction.scalar_theory.reference import order_powers
 from mitsuba_diffraction.settings import lobe_width
 from mitsuba_diffraction.surface.heightfield import HeightField
@@ -49,6 +52,23 @@ def test_the_loss_compares_the_lobes_of_the_orders_with_the_target():
         lobes = lobes.reshape(len(t), fine, -1).sum(1)
         differences.append(((lobes @ order_powers(field, kappa) @ lobes.T - t) ** 2).sum() / (t**2).sum())
     assert far_field.loss(heights)[0] == pytest.approx(np.mean(np.power(differences, 3)) ** (1 / 3), rel=1e-4)
+
+
+def test_the_distance_of_colours_is_that_of_oklab_at_equal_brightness():
+    """By colour-science. A grey of 0.01 is added, as it is the same in LMS."""
+    random = np.random.default_rng(4)
+    wavelengths = np.array([450.0, 520.0, 600.0, 660.0])
+    wanted, light = random.random((2, 4, 5, 5))
+    found, _ = ColourDistance.of(wanted, wavelengths)(light)
+    target, seen = (np.moveaxis(x, 0, -1) @ lamp_to_linear_sRGB(wavelengths) for x in (wanted, light))
+    target, seen = target / target.max(), seen * (luminance(target).sum() / luminance(seen).sum() / target.max())
+    pair = [colour.XYZ_to_Oklab(colour.RGB_to_XYZ(rgb + 0.01, "sRGB")) for rgb in (target, seen)]
+    expected = ((pair[0] - pair[1]) ** 2 * [1, 8, 8]).sum(axis=-1).mean()
+    assert found == pytest.approx(expected, rel=0.01)
+
+
+def luminance(rgb):
+    return colour.RGB_to_XYZ(rgb, "sRGB")[..., 1]
 
 
 def test_lobes_are_integrals_of_gaussians():

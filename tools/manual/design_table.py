@@ -4,6 +4,7 @@
     python tools/manual/design_table.py cat ring  # those whose names contain one of the words
     python tools/manual/design_table.py bound     # of other targets: what the lobes of the orders allow
     python tools/manual/design_table.py colours   # ΔE00 of two coloured pictures, by plate
+    python tools/manual/design_table.py sunset.png  # one of them, its prediction and its relief
 
 Times are of the processor, on one core.
 """
@@ -22,6 +23,7 @@ from numpy.typing import NDArray
 
 import mitsuba_diffraction as md
 from mitsuba_diffraction.files.picture_file import read_picture
+from mitsuba_diffraction.inverse_design.output import save_design_picture
 from mitsuba_diffraction.inverse_design.plate import Plate
 from mitsuba_diffraction.inverse_design.result import Design
 from mitsuba_diffraction.inverse_design.search import WHITE, _Search, far_field_of
@@ -145,6 +147,9 @@ def main(words: Sequence[str]) -> None:
     if list(words) == ["bound"]:
         for name, target in targets().items():
             print(bound(name, target), flush=True)
+        return
+    if list(words) and words[0].endswith("sunset.png"):
+        save_design_picture(md.design(coloured()["sunset"], starts=6, height_range=3.2), words[0])
         return
     if list(words) == ["colours"]:
         plates: dict[str, Mapping[str, int | float]] = {

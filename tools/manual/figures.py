@@ -78,6 +78,7 @@ FIGURES = (
         needs="a Python with bpy as $BLENDER_PYTHON (tools/manual/cycles_picture.py)",
     ),
     Figure(("design.png",), "mitsuba-diffraction design precompute/designed/cat.png -o {out}/design.gsf"),
+    Figure(("sunset.png",), "python tools/manual/design_table.py {out}/sunset.png"),
     Figure(
         ("word.jpg",),
         """mitsuba-diffraction design precompute/designed/diffract.png -o {out}/word.gsf
