@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import drjit as dr
 import mitsuba as mi
 import numpy as np
@@ -23,8 +25,9 @@ Parameters (XML or dictionary):
 
 The picture converges to the picture by `path` with the same parameters. A path tracer finds a small or distant light
 via a grating only by chance. Here, where a path from the eye meets a grating, several directions are drawn, and a ray
-is traced along one that is likely to meet a light (`candidates.py`). The light that gratings cast onto a wall, which
-appears as fireflies in `path`, is traced from the light:
+is traced along one that is likely to meet a light (`candidates.py`). Where the first surface is a grating, the light of
+a sun or a bulb is evaluated at 16 wavelengths, of which the film receives four (`lamps_without_extent.py`). The light
+that gratings cast onto a wall, which appears as fireflies in `path`, is traced from the light:
 
 With L a light, G a vertex on a surface whose BSDF is or contains a `diffraction_grating` (whichever component of it
 reflects or transmits the light: both sides of `twosided` and of a film, all of a blend, the base), X a vertex on any
@@ -54,7 +57,7 @@ finds much of this light in the picture, to 64, where it finds little; the numbe
 component.
 
 Without a grating, with max_depth of 0 or 1, in polarised variants, and for sensors other than `perspective` and
-`thinlens`, this is `path`. So it is with max_depth of 2 where lights have no extent, or are about as bright in all
+`thinlens`, this is `path`. So it is with max_depth of 2 where all lights have an extent and are about as bright in all
 directions. Instances and curves count as X. hide_emitters, and films with sample_border, are refused.
 It can be nested in `aov`. Gradients are computed by `path` (forward) and `prb` (backward), single rays (`sample`) by
 `path`.
@@ -80,9 +83,9 @@ def define() -> type:
             gratings = _lit_gratings(scene, sensor, self.max_depth)
             if gratings is None:
                 return self.path, None
-            eye = eye_class(scene, gratings, self.max_depth, self.rr_depth)
+            eye = eye_class(scene, sensor, gratings, self.max_depth, self.rr_depth)
             if 0 <= self.max_depth < 3:
-                return (eye if eye.candidates.any else self.path), None
+                return (eye if eye.candidates.any or eye.lamps.any else self.path), None
             if all(shape in gratings or _is_black(shape.bsdf()) for shape in scene.shapes()):
                 return eye, None
             return eye, LightPaths(scene, sensor, gratings, self.max_depth, self.rr_depth)
@@ -110,10 +113,15 @@ def define() -> type:
             if isinstance(sensor, int):
                 sensor = scene.sensors()[sensor]
             eye, light = self.parts(scene, sensor)
-            if light is None:
-                return eye.render(scene, sensor, seed, spp, develop, evaluate)
-            eye.render(scene, sensor, seed, spp, False, evaluate)
-            _add_light_paths(sensor, light, seed)
+            if hasattr(eye, "trace") and eye.lamps.any:
+                spp = _trace_eye_paths(scene, sensor, eye, seed, spp)
+            else:
+                if light is None:
+                    return eye.render(scene, sensor, seed, spp, develop, evaluate)
+                eye.render(scene, sensor, seed, spp, False, evaluate)
+                spp = sensor.sampler().sample_count()
+            if light is not None:
+                _add_light_paths(sensor, light, seed, spp)
             return sensor.film().develop() if develop else mi.TensorXf()
 
         # Dr.Jit does not differentiate splats. Derivatives are taken of `path` instead, which has the same expectation:
@@ -171,18 +179,42 @@ def _is_black(bsdf: mi.BSDF | None) -> bool:
     )
 
 
-def _add_light_paths(sensor: mi.Sensor, light: LightPaths, seed: mi.UInt32 | int) -> None:
-    """Add paths from the light to the film of a sensor, which contains the paths from the eye."""
+def _trace_eye_paths(scene: mi.Scene, sensor: mi.Sensor, eye: Any, seed: mi.UInt32 | int, spp: int) -> int:
+    """Put paths from the eye into the film of a sensor at wavelengths of their own; return the samples per pixel."""
+    # Mitsuba's rays, samplers and films of integrators in Python.
+    camera = nested_plugin("prb")
+    sampler, spp = camera.prepare(sensor, seed, spp)
+    ray, weight, position = camera.sample_rays(scene, sensor, sampler)
+    wavelengths, value, valid = eye.trace(scene, sampler, ray, weight)
+    block = sensor.film().create_block()
+    block.set_coalesce(block.coalesce() and spp >= 4)
+    _put(sensor.film(), block, position, wavelengths, value, dr.select(valid, mi.Float(1), 0), 1.0)
+    sensor.film().put_block(block)
+    return spp
+
+
+def _add_light_paths(sensor: mi.Sensor, light: LightPaths, seed: mi.UInt32 | int, spp: int) -> None:
+    """Add paths from the light to the film of a sensor, which contains `spp` paths from the eye per pixel."""
     film = sensor.film()
     # The film divides by its sum of weights, to which splats add zero: their values are multiplied by spp instead.
-    spp = sensor.sampler().sample_count()
     block = film.create_block()
     corner = mi.Vector2f(film.crop_offset())
     for splats in light.splats(seed, light.count(spp)):
         position, wavelengths, value = unpacked(splats)
-        if mi.has_flag(film.flags(), mi.FilmFlags.Special):
-            sample = film.prepare_sample(value * spp, wavelengths, block.channel_count(), 0.0, 0.0)
-            block.put(position + corner, sample)
-        else:
-            block.put(position + corner, wavelengths, value * spp, 0.0, 0.0)
+        _put(film, block, position + corner, wavelengths, value * spp, 0.0, 0.0)
     film.put_block(block)
+
+
+def _put(
+    film: mi.Film,
+    block: mi.ImageBlock,
+    position: mi.Point2f,
+    wavelengths: mi.Spectrum,
+    value: mi.Spectrum,
+    alpha: mi.Float | float,
+    weight: float,
+) -> None:
+    if mi.has_flag(film.flags(), mi.FilmFlags.Special):
+        block.put(position, film.prepare_sample(value, wavelengths, block.channel_count(), weight, alpha))
+    else:
+        block.put(position, wavelengths, value, alpha, weight)

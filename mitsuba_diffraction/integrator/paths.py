@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 
 from ..bsdf.base import gratings_in, is_grating, parts
 from .candidates import Candidates
+from .lamps_without_extent import LampsWithoutExtent, merged
 
 
 def quotient(a: mi.Float, b: mi.Float) -> mi.Float:
@@ -116,16 +117,18 @@ def define_eye_paths() -> type:
     class EyePaths(mi.SamplingIntegrator):
         """Mitsuba's `path` without the paths that are traced from the light (see `diffraction_path`)."""
 
-        def __init__(self, scene: mi.Scene, gratings: Gratings, max_depth: int, rr_depth: int) -> None:
+        def __init__(
+            self, scene: mi.Scene, sensor: mi.Sensor, gratings: Gratings, max_depth: int, rr_depth: int
+        ) -> None:
             mi.SamplingIntegrator.__init__(self, mi.Properties("eye_paths"))
             self.gratings, self.candidates = gratings, Candidates(scene, gratings.shapes)
+            self.lamps = LampsWithoutExtent(scene, sensor)
             # Whether L G X G E and L G X M E are short enough: a literal, which removes what serves them alone.
             self.guides = not 0 <= max_depth < 4
             # Opaque, so that all depths run the same kernel.
             self.max_depth = dr.opaque(mi.UInt32, max_depth % 2**32)
             self.rr_depth = dr.opaque(mi.UInt32, rr_depth)
 
-        @dr.syntax
         def sample(
             self,
             scene: mi.Scene,
@@ -134,15 +137,41 @@ def define_eye_paths() -> type:
             medium: mi.Medium | None = None,
             active: mi.Bool = True,
         ) -> tuple[mi.Spectrum, mi.Bool, list[mi.Float]]:
+            # All light at the wavelengths of the ray.
+            _, radiance, valid = self._trace(scene, sampler, ray, mi.Spectrum(1), active, False)
+            return radiance, valid, []
+
+        def trace(
+            self, scene: mi.Scene, sampler: mi.Sampler, ray: mi.RayDifferential3f, weight: mi.Spectrum
+        ) -> tuple[mi.Spectrum, mi.Spectrum, mi.Bool]:
+            """Return four wavelengths in nm, radiance times the weight of the sensor there, and validity.
+
+            The wavelengths are those of the ray where no light of lamps without extent is found at the first vertex.
+            """
+            return self._trace(scene, sampler, ray, weight, True, self.lamps.any)
+
+        @dr.syntax
+        def _trace(
+            self,
+            scene: mi.Scene,
+            sampler: mi.Sampler,
+            ray: mi.RayDifferential3f,
+            response: mi.Spectrum,
+            active: mi.Bool,
+            draws_wavelengths: bool,
+        ) -> tuple[mi.Spectrum, mi.Spectrum, mi.Bool]:
             ctx = mi.BSDFContext()
             si = scene.ray_intersect(ray, active)
             # Alpha is the same as in `path`: null interactions are transparent, an environment is not.
             valid = mi.Bool(scene.environment() is not None)
             result = si.emitter(scene).eval(si, active)
-            ray = mi.Ray3f(ray)
+            ray, ray_wavelengths = mi.Ray3f(ray), mi.Spectrum(ray.wavelengths)
             throughput, eta = mi.Spectrum(1.0), mi.Float(1.0)
             depth = mi.UInt32(1)
             active &= si.is_valid() & (depth < self.max_depth)
+            if dr.hint(draws_wavelengths, mode="scalar"):
+                first_on_grating, _ = self.gratings.classify(si, active)
+                of_lamps = self.lamps.light(scene, sampler, si, first_on_grating)
             # Whether an earlier vertex is not on a grating; whether the first vertex is on one or scatters specularly.
             has_other_vertex, from_eye_only = mi.Bool(False), mi.Bool(False)
             while active:
@@ -160,7 +189,14 @@ def define_eye_paths() -> type:
                 samples_emitter = active & mi.has_flag(bsdf.flags(), mi.BSDFFlags.Smooth)
                 point = sampler.next_2d(active)
                 samples_emitter &= from_light ^ True
+                # Probability of the emitters of which one is drawn.
+                share = mi.Float(1)
+                if dr.hint(draws_wavelengths, mode="scalar"):
+                    point, share, has_other = self.lamps.others(point, on_grating & (depth == 1))
+                    samples_emitter &= has_other
                 ds, emitted = scene.sample_emitter_direction(si, point, True, samples_emitter)
+                ds.pdf /= share
+                emitted *= share
                 wo = si.to_local(ds.d)
                 value, pdf = bsdf.eval_pdf(ctx, si_bsdf, wo, samples_emitter & (ds.pdf != 0))
                 slots = self.candidates.slots(si, on_grating & samples_emitter)
@@ -170,7 +206,7 @@ def define_eye_paths() -> type:
                 mis_weight = dr.select(ds.delta, 1, mis_weight)
                 result += dr.select(samples_emitter & (ds.pdf != 0), throughput * value * emitted * mis_weight, 0)
                 if dr.hint(self.candidates.any, mode="scalar"):
-                    light = self.candidates.sample(scene, sampler, si_bsdf, slots, slots > 0)
+                    light = self.candidates.sample(scene, sampler, si_bsdf, slots, share, slots > 0)
                     result += dr.select(slots > 0, throughput * light, 0)
 
                 # BSDF sampling, or the direction to a point on a grating; the next ray may hit an emitter.
@@ -195,7 +231,7 @@ def define_eye_paths() -> type:
                 ray = si.spawn_ray(dr.select(guided, to_point.d, si.to_world(bs.wo)))
                 next_si = scene.ray_intersect(ray, active)
                 ds = mi.DirectionSample3f(scene, next_si, si)
-                pdf_emitter = scene.pdf_emitter_direction(si, ds, active)
+                pdf_emitter = scene.pdf_emitter_direction(si, ds, active) / share
                 # Emitters are left to emitter sampling, whose weights ignore points on gratings.
                 on_target, _ = self.gratings.classify(next_si, to_gratings & next_si.is_valid())
                 on_target &= pdf_emitter == 0
@@ -219,7 +255,10 @@ def define_eye_paths() -> type:
                 roulette = depth >= self.rr_depth
                 active &= (roulette ^ True) | (sampler.next_1d(active) < survival)
                 throughput *= dr.select(roulette, quotient(1, survival), 1)
-            return result, valid, []
+            wavelengths, value = ray_wavelengths, response * result
+            if dr.hint(draws_wavelengths, mode="scalar"):
+                wavelengths, value = merged((wavelengths, value), of_lamps, sampler.next_1d())
+            return wavelengths, value, valid
 
     return EyePaths
 

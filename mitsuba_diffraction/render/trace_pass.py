@@ -308,8 +308,12 @@ def _trace(
     on_film = mi.Point2f(position.x, position.y + dr.opaque(mi.Float, first)) / mi.ScalarVector2f(columns, film_rows)
     ray, weight = sensor.sample_ray_differential(time, sampler.next_1d(), on_film, aperture)
     ray.scale_differential(spp**-0.5)
-    traced, valid, _ = integrator.sample(scene, sampler, ray, sensor.get_medium())
-    channel, value = _on_channels(film, ray.wavelengths, weight * traced)
+    if hasattr(integrator, "trace"):
+        wavelengths, value, valid = integrator.trace(scene, sampler, ray, weight)
+    else:
+        radiance, valid, _ = integrator.sample(scene, sampler, ray, sensor.get_medium())
+        wavelengths, value = ray.wavelengths, weight * radiance
+    channel, value = _on_channels(film, wavelengths, value)
     covered = [dr.select(valid, mi.Float(1), 0)] if alpha else []
     dr.eval(position, channel, value, covered)
     collected = functools.partial(collect, rfilter, position, size=shape, margins=margins, samples=equal_ranges(count))
