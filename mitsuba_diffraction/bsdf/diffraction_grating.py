@@ -31,15 +31,16 @@ PARAMETERS = (
         "profile",
         "string",
         f"an analytic surface instead of a file, one of {', '.join(f'`{name}`' for name in PROFILES)}. It takes the "
-        "parameters of the function of that name in `mitsuba_diffraction.gratings`, with lengths in µm, and "
-        "`coherence_length` and `largest_height_range` as in `precompute`. For a random surface (one with a `seed`), "
-        "`patches` is the number of seeds over which the spectrum is averaged, by default 48 for discs and 16 for the "
-        f"others, at most {MAX_PATCHES}",
+        "parameters of the function of that name in [`mitsuba_diffraction.gratings`](reference/surfaces.md), with "
+        "lengths in µm, and [`coherence_length`](own_grating.md#coherence-length) (65 µm, 26 with a `seed`) and "
+        "`largest_height_range` (20 µm). For a random surface (one with a `seed`), `patches` is the number of seeds "
+        f"over which the spectrum is averaged, by default 48 for discs and 16 for the others, at most {MAX_PATCHES}",
     ),
     Parameter(
         "tolerance",
         "float",
-        "tolerance of the spectrum, as in `precompute`; for a profile, or for a recipe, whose value it replaces",
+        "[tolerance](own_grating.md#tolerance) of the spectrum; for a profile, or for a recipe, whose value it "
+        "replaces",
     ),
     Parameter(
         "representation",
