@@ -92,7 +92,7 @@ class Settings:
     def __post_init__(self) -> None:
         self._check("coherence_length", lambda x: lobe_width(x) > 0, "a number")
         if self.tolerance is not None:
-            wanted = f"a fraction of the light, from {self.min_tolerance:g} to 1"
+            wanted = f"a fraction of the light, at least {self.min_tolerance:g} and below 1"
             self._check("tolerance", lambda x: self.min_tolerance <= x < self._tolerance_limit, wanted)
         self._check("largest_height_range", lambda x: x > 0, "a positive number of µm")
         try:

@@ -95,7 +95,8 @@ def design(
             makers.check_gds(levels)
     outputs = [path.with_suffix(suffix) for suffix in SUFFIXES]
     outputs += exports.values()
-    check_outputs([target], [("-o", output) for output in outputs], overwrite=overwrite)
+    named = [("-o" if output == path else f"-o {path}", output) for output in outputs]
+    check_outputs([target], named, overwrite=overwrite)
     if picture.max() == 0:
         help_ = "" if invert else "; --invert casts what is dark"
         raise RequestError(f"{target}: got {'white' if invert else 'black'} alone, wanted light somewhere{help_}")

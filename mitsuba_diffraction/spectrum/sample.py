@@ -57,7 +57,7 @@ def effective_coherence_length(height_field: HeightField, requested: float) -> f
         if count > 1 and effective < _MIN_PIXELS * pixel * (1 - 1e-9):
             raise RequestError(
                 f"coherence_length: got {requested:g} µm, of which the scan of {axes[0][0]:.4g} × {axes[1][0]:.4g} µm "
-                f"supports {effective:.4g}; wanted at least {_MIN_PIXELS} pixels ({_MIN_PIXELS * pixel:.4g} µm)"
+                f"supports {effective:.4g}; wanted at least {_MIN_PIXELS} pixels of {pixel:.4g} µm"
             )
     return effective
 

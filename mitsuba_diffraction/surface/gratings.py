@@ -58,6 +58,8 @@ def ruled(lines_per_mm: float = 600.0, *, blaze_wavelength: float = 500.0, sampl
     """
     check_positive("lines_per_mm", lines_per_mm, "of lines per mm")
     check_positive("blaze_wavelength", blaze_wavelength, "of nm")
+    if blaze_wavelength < 10:
+        raise RequestError(f"blaze_wavelength: got {blaze_wavelength:g} nm, wanted at least 10 nm, not µm")
     period = 1000 / lines_per_mm
     sine = blaze_wavelength * 1e-3 / (2 * period)
     if sine >= 1:

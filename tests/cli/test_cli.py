@@ -76,7 +76,7 @@ def files():
         ("precompute deep.toml,representation=taylor", "of a range of 4.92 µm"),
         ("precompute blaze.toml,terms=20", "terms: got 20 with representation 'auto', wanted it with a series"),
         ("precompute blaze.toml,representation=taylor,terms=20.5", "terms: got 20.5, wanted a whole number"),
-        ("precompute scan.npy,pixel_size=0.05,extent=sample", "wanted at least 4 pixels (0.2 µm)"),
+        ("precompute scan.npy,pixel_size=0.05,extent=sample", "wanted at least 4 pixels of 0.05 µm"),
         ("precompute blaze.toml,pixel_size=0.1", "blaze.toml: got pixel_size, wanted some of period, depth, "),
         ("precompute blaze.toml,tolerence=0.1", "; did you mean tolerance?"),
         ("precompute blaze.toml,depth", "blaze.toml,depth: got 'depth', wanted name=value"),

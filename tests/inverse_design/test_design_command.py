@@ -182,7 +182,7 @@ def test_an_interrupted_command_writes_the_best_so_far(command, monkeypatch, num
         ("cut.png", "cut.png: not a picture that can be read"),
         ("gone.png", "gone.png: no such file"),
         ("flag.png -o plate.exr", "-o: got plate.exr, wanted a file name that ends in .gsf or .tif"),
-        ("flag.png -o flag.gsf", "-o: would overwrite flag.png, which is read"),
+        ("flag.png -o flag.gsf", "-o flag.gsf: would overwrite flag.png, which is read"),
         ("flag.png --wavelength red", "--wavelength: got 'red', wanted a number"),
         ("flag.png --texel 0.2", "error: --texel: got 0.2 µm, wanted more than half the wavelength"),
         ("flag.png --detail 8 --texels 12", "--detail: got 8 and --texels 12, wanted one of them"),

@@ -62,6 +62,7 @@ def test_a_ruled_grating_diffracts_its_blaze_wavelength_into_the_littrow_order(l
     [
         ({"lines_per_mm": 0}, "lines_per_mm: got 0, wanted a positive number"),
         ({"lines_per_mm": "600"}, "lines_per_mm: got '600'"),
+        ({"blaze_wavelength": 0.8}, "blaze_wavelength: got 0.8 nm, wanted at least 10 nm, not µm"),
         ({"blaze_wavelength": np.nan}, "blaze_wavelength: got nan"),
         ({"blaze_wavelength": 4000}, r"blaze_wavelength: got 4000 nm, wanted less than twice the period, 3333 nm"),
         ({"samples": 1}, "samples: got 1"),
