@@ -3,8 +3,8 @@
     python tools/manual/picture_error.py docs/picture_error.png
 
 The disc is rendered by `diffraction_path`, by `path`, and as a rough conductor in place of the grating, in turn and in
-one process. The error is the root of Σ(c − c_ref)²/Σ c_ref² of linear sRGB on the disc; the mean CIEDE2000 is
-printed, too. Points are medians over seeds, bands reach from the lowest to the highest.
+one process. The references are by `path`. The error is the root of Σ(c − c_ref)²/Σ c_ref² of linear sRGB on the disc;
+the mean CIEDE2000 is printed, too. Points are medians over seeds, bands reach from the lowest to the highest.
 """
 
 from __future__ import annotations
@@ -34,7 +34,8 @@ from mitsuba_diffraction.shader_2014.comparison.difference import difference, wh
 Array = NDArray[np.float64]
 
 WIDTH, DEPTH = 96, 2
-COUNTS, SEEDS, REFERENCE = (16, 64, 256), 7, 2048
+COUNTS, SEEDS = (16, 64, 256), 7
+REFERENCES = {"path": 12288, "roughconductor": 2048}  # samples
 ROUGH = {"type": "roughconductor", "material": "Al", "alpha": 0.08}
 KINDS = {  # label → what stands in place of the grating, integrator, colour
     "path": (None, "path", "#c0392b"),
@@ -68,8 +69,8 @@ def measure() -> dict[str, Array]:
         for kind, (partner, integrator, _) in KINDS.items()
     }
     where = shows_gratings(scenes["diffraction_path"])
-    references = {kind: picture(scenes[kind], REFERENCE, 1000)[0] for kind in ("diffraction_path", "roughconductor")}
-    references["path"] = references["diffraction_path"]
+    references = {kind: picture(scenes[kind], count, 1000)[0] for kind, count in REFERENCES.items()}
+    references["diffraction_path"] = references["path"]
     found = {kind: np.zeros((3, SEEDS, len(COUNTS))) for kind in KINDS}
     with progress_bar("pictures") as bar:
         for column, count in enumerate(COUNTS):
