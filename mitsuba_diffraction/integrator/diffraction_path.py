@@ -185,10 +185,12 @@ def _trace_eye_paths(scene: mi.Scene, sensor: mi.Sensor, eye: Any, seed: mi.UInt
     camera = nested_plugin("prb")
     sampler, spp = camera.prepare(sensor, seed, spp)
     ray, weight, position = camera.sample_rays(scene, sensor, sampler)
-    wavelengths, value, valid = eye.trace(scene, sampler, ray, weight)
+    (of_ray, of_lamps), valid = eye.trace(scene, sampler, ray, weight)
     block = sensor.film().create_block()
     block.set_coalesce(block.coalesce() and spp >= 4)
-    _put(sensor.film(), block, position, wavelengths, value, dr.select(valid, mi.Float(1), 0), 1.0)
+    alpha = dr.select(valid, mi.Float(1), 0)
+    for (wavelengths, value), opacity, weight_of_film in ((of_ray, alpha, 1.0), (of_lamps, 0.0, 0.0)):
+        _put(sensor.film(), block, position, wavelengths, value, opacity, weight_of_film)
     sensor.film().put_block(block)
     return spp
 

@@ -8,10 +8,10 @@ the sensor:
 
     v_k = w(λ_k) f(λ_k) |cos θ| E(λ_k) 4/(K P)
 
-The film receives four of these values and of w L at the four wavelengths of the ray, where L is all other light. With
-V their sum and ξ a random number, these are the ones in whose part of the sum, in order of the wavelengths, ξ V/4,
-(1 + ξ) V/4, (2 + ξ) V/4 and (3 + ξ) V/4 lie (systematic resampling, Kitagawa 1996). Each counts V/4. A value v is thus
-kept v/(V/4) times in the mean, and the expectation of each channel of the film is unchanged.
+Beside all other light at the four wavelengths of the ray, the film receives four of these values. With V their sum and
+ξ a random number, these are the ones in whose part of the sum, in order of the wavelengths, ξ V/4, (1 + ξ) V/4,
+(2 + ξ) V/4 and (3 + ξ) V/4 lie (systematic resampling, Kitagawa 1996). Each counts V/4. A value v is thus kept v/(V/4)
+times in the mean, and the expectation of each channel of the film is unchanged.
 """
 
 from __future__ import annotations
@@ -108,17 +108,6 @@ class Emitters:
         index, rest = self._choice.sample_reuse(point.x, active)
         first, extent = dr.gather(mi.Float, self._first, index, active), dr.gather(mi.Float, self._range, index, active)
         return mi.Point2f(smaller(dr.fma(rest, extent, first), BELOW_ONE), point.y)
-
-
-def merged(
-    first: tuple[mi.Spectrum, mi.Spectrum], second: tuple[mi.Spectrum, mi.Spectrum], number: mi.Float
-) -> tuple[mi.Spectrum, mi.Spectrum]:
-    """Return four of two times four wavelengths and values; the first ones where all second values are zero."""
-    pairs = [list(zip(*of_either, strict=True)) for of_either in (first, second)]
-    in_order = [pair for both in zip(*pairs, strict=True) for pair in both]
-    any_second = dr.any(second[1] != 0)
-    kept = _resampled(in_order, number)
-    return mi.Spectrum(dr.select(any_second, kept[0], first[0])), mi.Spectrum(dr.select(any_second, kept[1], first[1]))
 
 
 def _resampled(samples: Sequence[tuple[mi.Float, mi.Float]], number: mi.Float) -> tuple[mi.Spectrum, mi.Spectrum]:

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from ..bsdf.base import gratings_in, is_grating, parts
 from .candidates import Candidates
-from .lamps_without_extent import LampsWithoutExtent, merged
+from .lamps_without_extent import LampsWithoutExtent
 
 
 def quotient(a: mi.Float, b: mi.Float) -> mi.Float:
@@ -138,15 +138,15 @@ def define_eye_paths() -> type:
             active: mi.Bool = True,
         ) -> tuple[mi.Spectrum, mi.Bool, list[mi.Float]]:
             # All light at the wavelengths of the ray.
-            _, radiance, valid = self._trace(scene, sampler, ray, mi.Spectrum(1), active, False)
+            ((_, radiance),), valid = self._trace(scene, sampler, ray, mi.Spectrum(1), active, False)
             return radiance, valid, []
 
         def trace(
             self, scene: mi.Scene, sampler: mi.Sampler, ray: mi.RayDifferential3f, weight: mi.Spectrum
-        ) -> tuple[mi.Spectrum, mi.Spectrum, mi.Bool]:
-            """Return four wavelengths in nm, radiance times the weight of the sensor there, and validity.
+        ) -> tuple[list[tuple[mi.Spectrum, mi.Spectrum]], mi.Bool]:
+            """Return four wavelengths in nm and radiance times the weight of the sensor there, and validity.
 
-            The wavelengths are those of the ray where no light of lamps without extent is found at the first vertex.
+            If there are lamps without extent, a second pair has their light at the first vertex.
             """
             return self._trace(scene, sampler, ray, weight, True, self.lamps.any)
 
@@ -159,7 +159,7 @@ def define_eye_paths() -> type:
             response: mi.Spectrum,
             active: mi.Bool,
             draws_wavelengths: bool,
-        ) -> tuple[mi.Spectrum, mi.Spectrum, mi.Bool]:
+        ) -> tuple[list[tuple[mi.Spectrum, mi.Spectrum]], mi.Bool]:
             ctx = mi.BSDFContext()
             si = scene.ray_intersect(ray, active)
             # Alpha is the same as in `path`: null interactions are transparent, an environment is not.
@@ -255,10 +255,10 @@ def define_eye_paths() -> type:
                 roulette = depth >= self.rr_depth
                 active &= (roulette ^ True) | (sampler.next_1d(active) < survival)
                 throughput *= dr.select(roulette, quotient(1, survival), 1)
-            wavelengths, value = ray_wavelengths, response * result
+            found = [(ray_wavelengths, response * result)]
             if dr.hint(draws_wavelengths, mode="scalar"):
-                wavelengths, value = merged((wavelengths, value), of_lamps, sampler.next_1d())
-            return wavelengths, value, valid
+                found = [*found, of_lamps]
+            return found, valid
 
     return EyePaths
 

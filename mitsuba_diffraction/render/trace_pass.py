@@ -309,11 +309,15 @@ def _trace(
     ray, weight = sensor.sample_ray_differential(time, sampler.next_1d(), on_film, aperture)
     ray.scale_differential(spp**-0.5)
     if hasattr(integrator, "trace"):
-        wavelengths, value, valid = integrator.trace(scene, sampler, ray, weight)
+        received, valid = integrator.trace(scene, sampler, ray, weight)
     else:
         radiance, valid, _ = integrator.sample(scene, sampler, ray, sensor.get_medium())
-        wavelengths, value = ray.wavelengths, weight * radiance
-    channel, value = _on_channels(film, wavelengths, value)
+        received = [(ray.wavelengths, weight * radiance)]
+    channel, value = [], []
+    for wavelengths, of_light in received:
+        channels_of_light, values = _on_channels(film, wavelengths, of_light)
+        channel += channels_of_light
+        value += values
     covered = [dr.select(valid, mi.Float(1), 0)] if alpha else []
     dr.eval(position, channel, value, covered)
     collected = functools.partial(collect, rfilter, position, size=shape, margins=margins, samples=equal_ranges(count))

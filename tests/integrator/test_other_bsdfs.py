@@ -93,7 +93,7 @@ def test_a_tinted_bsdf_is_no_noisier_than_with_path(llvm):
     tinted = {"type": "principled", "base_color": rgb(0.8, 0.05, 0.02), "specular": 0.5, "spec_tint": 1.0}
     built = above(tinted, 26.0)
     integrators = [mi.load_dict({"type": name, "max_depth": 12}) for name in ("path", "diffraction_path")]
-    (wanted, its_error), (found, error) = (region_means(built, each, 256) for each in integrators)
+    (wanted, its_error), (found, error) = (region_means(built, each, 256, 48) for each in integrators)
     np.testing.assert_array_less(np.abs(found - wanted), 4 * np.hypot(its_error, error))
     assert error.max() < its_error.max()
 
