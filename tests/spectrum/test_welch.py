@@ -47,7 +47,7 @@ def test_a_scan_supports_half_of_its_shorter_side(rows, columns, pixel, requeste
             "coherence_length: got 65 µm, of which the scan of 0.7 × 10 µm supports 0.35; wanted at least 4",
         ),
         (7, 100, 65.0, "supports 0.35"),
-        (100, 100, 0.3, r"got 0.3 µm.* wanted at least 4 pixels \(0.4 µm\)"),
+        (100, 100, 0.3, r"got 0.3 µm.* wanted at least 4 pixels of 0.1 µm"),
         (2, 100, 65.0, "supports 0.1"),
         (1, 1, 0.0, "coherence_length: got 0.0"),
         (100, 100, np.nan, "coherence_length: got nan"),
