@@ -88,6 +88,7 @@ def test_a_notebook_runs(path):
     assert pictures(notebook)
 
 
+@pytest.mark.slow
 def test_what_the_notebooks_import_exists():
     # Reduced cells leave out what takes long: functions that are gone would be missed.
     def imports(notebook):
