@@ -25,7 +25,7 @@ from mitsuba_diffraction.shader_2014.quirks import Quirks
 ROOT = Path(__file__).parents[1]
 PACKAGE = Path(md.__file__).parent
 PAGES = [ROOT / "README.md", *sorted((ROOT / "docs").glob("*.md"))]
-SLOW = {"compare", "design", "export", "index", "long_renders", "own_grating", "own_scan", "plugin", "viewer"}
+SLOW = {"compare", "design", "export", "index", "long_renders", "own_grating", "own_scan", "plugin", "python", "viewer"}
 """Pages whose code takes long."""
 BLOCK = re.compile(r"^(?P<indent> *)```(?P<language>\w+)\n(?P<body>.*?)^ *```$", re.DOTALL | re.MULTILINE)
 REDUCED = {

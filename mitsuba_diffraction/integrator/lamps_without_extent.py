@@ -66,7 +66,7 @@ class LampsWithoutExtent:
                 values[k] = mi.Spectrum(dr.select(lit & (packet == k), value, values[k]))
             packet += 1
         in_order = [(wavelengths[k][j], values[k][j]) for j in range(4) for k in range(_PACKETS)]
-        kept, value = _resampled(in_order, number)
+        kept, value = resampled(in_order, number)
         # The scene draws one of all emitters.
         probability = ds.pdf / self._lamps.probability
         return kept, dr.select(active, value / (_PACKETS * probability), 0)
@@ -110,7 +110,7 @@ class Emitters:
         return mi.Point2f(smaller(dr.fma(rest, extent, first), BELOW_ONE), point.y)
 
 
-def _resampled(samples: Sequence[tuple[mi.Float, mi.Float]], number: mi.Float) -> tuple[mi.Spectrum, mi.Spectrum]:
+def resampled(samples: Sequence[tuple[mi.Float, mi.Float]], number: mi.Float) -> tuple[mi.Spectrum, mi.Spectrum]:
     """Keep four of any number of wavelengths and values by systematic resampling."""
     share = sum(value for _, value in samples) / 4
     kept, before = [samples[0][0]] * 4, mi.Float(0)

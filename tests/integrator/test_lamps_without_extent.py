@@ -2,21 +2,19 @@
 
 from functools import partial
 from itertools import pairwise
-from pathlib import Path
 
 import drjit as dr
 import mitsuba as mi
 import numpy as np
 import pytest
 from bsdf_support import bitmap, grating, uniform
+from test_candidates import assert_bins_agree
 
 import mitsuba_diffraction  # noqa: F401 (settles which LLVM is used before a variant is set)
 from mitsuba_diffraction.evaluation.benchmark import noise
-from mitsuba_diffraction.integrator.lamps_without_extent import Emitters, _resampled
+from mitsuba_diffraction.integrator.lamps_without_extent import Emitters, resampled
 from mitsuba_diffraction.render.scene_file import SceneFile
-from mitsuba_diffraction.render.trace_pass import trace_pass
 
-SCENES = Path(__file__).parents[2] / "scenes"
 EYE = np.array([0.6, -0.9, 2.0])
 EDGES = np.linspace(360, 830, 11)  # of ten bins, nm
 RISING = {"type": "regular", "wavelength_min": 360, "wavelength_max": 830, "values": "0.2, 1.5, 0.7"}
@@ -194,7 +192,7 @@ def test_resampling_keeps_each_wavelength_in_proportion_to_its_value(llvm):
     wavelengths, values = (410.0, 450, 500, 540, 590, 630, 680, 720), (0.0, 1.0, 3.0, 0.0, 0.5, 0.25, 0.0, 6.0)
     number = (dr.arange(mi.Float, 4000) + 0.5) / 4000
     of_each = zip(map(mi.Float, wavelengths), map(mi.Float, values), strict=True)
-    kept, value = (np.broadcast_to(np.array(x), (4, 4000)) for x in _resampled(list(of_each), number))
+    kept, value = (np.broadcast_to(np.array(x), (4, 4000)) for x in resampled(list(of_each), number))
     for wavelength, wanted in zip(wavelengths, values, strict=True):
         assert value[kept == wavelength].sum() / 4000 == pytest.approx(wanted, abs=3e-3)
 
@@ -263,13 +261,4 @@ def test_pictures_have_the_means_of_path(film, sensor, llvm):
 )
 def test_every_bin_of_a_scene_agrees_with_path(name, depth, parameters, llvm, monkeypatch):
     monkeypatch.setattr(noise, "SceneFile", partial(SceneFile, parameters=parameters))
-    found = {}
-    for integrator in ("path", "diffraction_path"):
-        built = noise.load_for_noise(SCENES / f"{name}.xml", 64, None, type=integrator, max_depth=depth)
-        passes = [trace_pass(built, 64, seed).sum(axis=(0, 1)) for seed in range(16)]
-        means = np.array([each[:-1] / each[-1] for each in passes])
-        found[integrator] = np.column_stack([means, means.mean(axis=1)])
-    means, errors = ([f(found[k]) for k in found] for f in (lambda x: x.mean(0), lambda x: x.std(0, ddof=1) / 4))
-    scores = (means[1] - means[0]) / np.hypot(*errors)
-    assert np.abs(scores).max() < 4
-    assert np.sqrt(np.mean(scores**2)) < 1.6  # bins are not independent of each other
+    assert_bins_agree(name, depth)

@@ -547,6 +547,7 @@ def disc():
     return Surface.named("compact_disc", small)
 
 
+@pytest.mark.slow
 def test_the_first_frame_has_no_visible_noise(disc, opened):
     """Differences of neighbouring pixels on the tracks, after one frame and after many."""
     tab = opened(disc)
