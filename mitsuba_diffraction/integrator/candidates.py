@@ -110,10 +110,10 @@ class Candidates:
         sampler: mi.Sampler,
         si: mi.SurfaceInteraction3f,
         slots: mi.UInt32,
-        share: mi.Float,
+        probability: mi.Float,
         active: mi.Bool,
     ) -> mi.Spectrum:
-        """Return the light of all slots, the first sum above; light samples draw a `share` of the emitters."""
+        """Return the light of all slots, the first sum above; `probability` is that of the emitters that are drawn."""
         ctx, result, bsdf = mi.BSDFContext(), mi.Spectrum(0), si.bsdf()
         shift, jitter = sampler.next_2d(active), sampler.next_1d(active)
         number = dr.gather(mi.UInt32, self._table, 2 * dr.reinterpret_array(mi.UInt32, si.shape) + 1, active)
@@ -133,7 +133,7 @@ class Candidates:
             emitted = ds.emitter.eval(found, kept)
             # c/(M π)
             weight = count / dr.fma(count * fraction, 1 - self._fraction, self._fraction)
-            weight /= dr.fma(total, pdf, pdf_emitter / share)
+            weight /= dr.fma(total, pdf, pdf_emitter / probability)
             result += dr.select(kept, value * emitted * weight, 0)
             slot += 1
         return result

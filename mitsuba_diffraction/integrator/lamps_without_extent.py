@@ -112,10 +112,10 @@ class Emitters:
 
 def resampled(samples: Sequence[tuple[mi.Float, mi.Float]], number: mi.Float) -> tuple[mi.Spectrum, mi.Spectrum]:
     """Keep four of any number of wavelengths and values by systematic resampling."""
-    share = sum(value for _, value in samples) / 4
+    of_each = sum(value for _, value in samples) / 4
     kept, before = [samples[0][0]] * 4, mi.Float(0)
     for wavelength, value in samples:
         for i in range(4):
-            kept[i] = dr.select((value > 0) & (before <= (number + i) * share), wavelength, kept[i])
+            kept[i] = dr.select((value > 0) & (before <= (number + i) * of_each), wavelength, kept[i])
         before += value
-    return mi.Spectrum(kept), mi.Spectrum(share)
+    return mi.Spectrum(kept), mi.Spectrum(of_each)

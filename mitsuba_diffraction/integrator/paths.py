@@ -189,14 +189,14 @@ def define_eye_paths() -> type:
                 samples_emitter = active & mi.has_flag(bsdf.flags(), mi.BSDFFlags.Smooth)
                 point = sampler.next_2d(active)
                 samples_emitter &= from_light ^ True
-                # Probability of the emitters of which one is drawn.
-                share = mi.Float(1)
+                # That of the emitters of which one is drawn.
+                probability = mi.Float(1)
                 if dr.hint(draws_wavelengths, mode="scalar"):
-                    point, share, has_other = self.lamps.others(point, on_grating & (depth == 1))
+                    point, probability, has_other = self.lamps.others(point, on_grating & (depth == 1))
                     samples_emitter &= has_other
                 ds, emitted = scene.sample_emitter_direction(si, point, True, samples_emitter)
-                ds.pdf /= share
-                emitted *= share
+                ds.pdf /= probability
+                emitted *= probability
                 wo = si.to_local(ds.d)
                 value, pdf = bsdf.eval_pdf(ctx, si_bsdf, wo, samples_emitter & (ds.pdf != 0))
                 slots = self.candidates.slots(si, on_grating & samples_emitter)
@@ -206,7 +206,7 @@ def define_eye_paths() -> type:
                 mis_weight = dr.select(ds.delta, 1, mis_weight)
                 result += dr.select(samples_emitter & (ds.pdf != 0), throughput * value * emitted * mis_weight, 0)
                 if dr.hint(self.candidates.any, mode="scalar"):
-                    light = self.candidates.sample(scene, sampler, si_bsdf, slots, share, slots > 0)
+                    light = self.candidates.sample(scene, sampler, si_bsdf, slots, probability, slots > 0)
                     result += dr.select(slots > 0, throughput * light, 0)
 
                 # BSDF sampling, or the direction to a point on a grating; the next ray may hit an emitter.
@@ -231,7 +231,7 @@ def define_eye_paths() -> type:
                 ray = si.spawn_ray(dr.select(guided, to_point.d, si.to_world(bs.wo)))
                 next_si = scene.ray_intersect(ray, active)
                 ds = mi.DirectionSample3f(scene, next_si, si)
-                pdf_emitter = scene.pdf_emitter_direction(si, ds, active) / share
+                pdf_emitter = scene.pdf_emitter_direction(si, ds, active) / probability
                 # Emitters are left to emitter sampling, whose weights ignore points on gratings.
                 on_target, _ = self.gratings.classify(next_si, to_gratings & next_si.is_valid())
                 on_target &= pdf_emitter == 0
