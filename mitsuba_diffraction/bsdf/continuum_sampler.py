@@ -20,7 +20,7 @@ from ..precomputation.grating_spectrum import GratingSpectrum
 from ..spectrum.grids import OrderGrid, spline_integral
 from .device_tables import PacketTable, ProbabilityTable, larger, opaque
 from .directions import Incidence
-from .inversion import KAPPA_BINS, KappaBins, choose_bin, cumulative_sums, mean_powers, search
+from .inversion import KAPPA_BINS, AliasTable, KappaBins, choose_bin, cumulative_sums, mean_powers, search
 
 MAX_SAMPLER_BIN_WIDTH = 2.0  # in σ_q
 MAX_BIN_SPACING = 0.06  # cycles/µm, where lobes are wide
@@ -75,8 +75,8 @@ class BinSampler:
     evanescent: only the rows that meet the disc are drawn and summed. Rows lie across this axis. Where they have nearly
     no power, no q is drawn, and the density is zero.
 
-    A bin is drawn by two binary searches, for its row and for its block of columns; the density at a given q reads two
-    words, of lines and ridges two packets more.
+    A bin is drawn by two alias tables, for its row and for its block of columns; rows that meet the disc are searched.
+    The density at a given q reads two words, of lines and ridges two packets more.
     """
 
     def __init__(self, spectrum: GratingSpectrum, typical_max_kappa: float | None = None) -> None:
@@ -99,8 +99,11 @@ class BinSampler:
         of_blocks = self.powers.values.astype(np.float64).reshape(len(powers), -1, BLOCK, KAPPA_BINS).sum(axis=2)
         of_rows = of_blocks.sum(axis=1)
         self.rows, self.blocks = of_blocks.shape[:2]
-        self.cumulative_rows = PacketTable(cumulative_sums(of_rows))
-        self.cumulative_blocks = PacketTable(cumulative_sums(of_blocks / np.maximum(of_rows[:, None], 1e-30)))
+        if self.is_line:
+            self.cumulative_rows = PacketTable(cumulative_sums(of_rows))
+        else:
+            self.row_choice = AliasTable(of_rows.T)
+        self.block_choice = AliasTable(np.moveaxis(of_blocks, 1, 2))
         self.total = mi.Vector4f(*map(opaque, of_rows.sum(axis=0)))
         self.max_index = along_x.max_index, along_y.max_index
         self.spacing = opaque(along_x.spacing), opaque(along_y.spacing)
@@ -137,16 +140,17 @@ class BinSampler:
         centre = self._axes(-incidence.tangent * incidence.frequency)
         kappa_bin, u = choose_bin(self.kappa_bins.weights(incidence), u)
 
-        def cumulative(table: PacketTable, index: mi.Int32) -> mi.Float:
-            return table.component(mi.UInt32(index), kappa_bin, active)
-
-        rows, blocks = self._rows(centre, incidence), (mi.Int32(0), mi.Int32(self.blocks))
         if self.is_line:
-            first, end = (cumulative(self.cumulative_rows, row) for row in rows)
-            active = active & (end - first > MIN_MASS)
-        row, _ = search(lambda i: cumulative(self.cumulative_rows, i), *rows, self.rows, u)
-        start = row * (self.blocks + 1)
-        block, x = search(lambda i: cumulative(self.cumulative_blocks, start + i), *blocks, self.blocks, v.x)
+
+            def cumulative(index: mi.Int32) -> mi.Float:
+                return self.cumulative_rows.component(mi.UInt32(index), kappa_bin, active)
+
+            first, end = self._rows(centre, incidence)
+            active = active & (cumulative(end) - cumulative(first) > MIN_MASS)
+            row, _ = search(cumulative, first, end, self.rows, u)
+        else:
+            row, _ = self.row_choice.draw(kappa_bin, u, active)
+        block, x = self.block_choice.draw(mi.UInt32(row) * KAPPA_BINS + kappa_bin, v.x, active)
         column, x = choose_bin(self.powers.block(mi.UInt32(row * self.blocks + block), kappa_bin, active), x)
         bins = mi.Point2f(BLOCK * block + mi.Int32(column) - self.max_index[0], row - self.max_index[1])
         q = mi.Point2f((bins.x + x - 0.5) * self.spacing[0], (bins.y + v.y - 0.5) * self.spacing[1])

@@ -22,7 +22,7 @@ from numpy.typing import NDArray
 
 from ..energy.table import Layout
 from ..precomputation.grating_spectrum import GratingSpectrum
-from .device_tables import BELOW_ONE, larger, limited, opaque
+from .device_tables import BELOW_ONE, PacketTable, integer_part, larger, limited, opaque, smaller
 from .directions import Incidence, cell_of, on_square
 
 KAPPA_BINS = 4  # the components of a packet
@@ -119,6 +119,57 @@ def search(
         index = dr.select(is_past, trial, index)
         low, high = dr.select(is_past, value, low), dr.select(is_past, high, value)
     return index, limited((target - low) / larger(high - low, 1e-30), 0, BELOW_ONE)
+
+
+class AliasTable:
+    """Draws from discrete distributions in constant time (Walker 1977).
+
+    With n p_i the probabilities times their number, each i has the number t_i ≤ 1 and an alias a_i, so that
+
+        n p_i = t_i + Σ_j [a_j = i] (1 − t_j)
+
+    i is drawn uniformly; it is replaced by a_i with the probability 1 − t_i.
+    """
+
+    def __init__(self, weights: NDArray[np.float64]) -> None:
+        """Make the tables of all distributions, (..., n); one whose weights are all zero becomes uniform."""
+        self.count = weights.shape[-1]
+        p = np.asarray(weights, np.float64).reshape(-1, self.count)
+        p = np.where(p.any(axis=1, keepdims=True), p, 1)
+        p *= self.count / p.sum(axis=1, keepdims=True)
+        of_each = np.arange(len(p))
+        # Those with n p ≤ 1, then the others. The first are filled up by the others, in their order: neighbouring
+        # numbers mostly draw neighbours (sweep of Hübschle-Schneider and Sanders 2022).
+        order = np.argsort(p > 1, axis=1, kind="stable")
+        low, high = np.zeros(len(p), np.int64), (p <= 1).sum(axis=1)
+        lows, last = high.copy(), self.count - 1
+        rest = p[of_each, order[of_each, np.minimum(high, last)]]
+        threshold, alias = np.ones_like(p), np.tile(np.arange(self.count), (len(p), 1))
+        for _ in range(self.count):
+            fills = (rest > 1) & (low < lows)
+            ends = ~fills & (high < last)
+            at = of_each[fills], order[of_each, np.minimum(low, last)][fills]
+            threshold[at], alias[at] = p[at], order[of_each, np.minimum(high, last)][fills]
+            rest[fills] += p[at] - 1
+            low += fills
+            at = of_each[ends], order[of_each, high.clip(max=last)][ends]
+            following = order[of_each, (high + 1).clip(max=last)][ends]
+            threshold[at], alias[at] = rest[ends], following
+            rest[ends] += p[of_each[ends], following] - 1
+            high += ends
+        self._table = PacketTable(np.stack([threshold.clip(0, 1), alias], axis=-1), width=2)
+
+    def draw(self, distribution: mi.UInt32, u: mi.Float, active: mi.Bool) -> tuple[mi.Int32, mi.Float]:
+        """Draw an index from one of the distributions; return it, and `u` rescaled to a number uniform in [0, 1)."""
+        scaled = u * self.count
+        index = integer_part(smaller(scaled, self.count - 1))
+        scaled = limited(scaled - mi.Float(index), 0, BELOW_ONE)
+        threshold, alias = self._table(distribution * self.count + index, active)
+        is_own = scaled < threshold
+        rest = dr.select(is_own, scaled, scaled - threshold) / larger(
+            dr.select(is_own, threshold, 1 - threshold), 1e-30
+        )
+        return dr.select(is_own, mi.Int32(index), mi.Int32(alias)), limited(rest, 0, BELOW_ONE)
 
 
 def truncated_gaussian(u: mi.Float, inside: mi.Float, spread: mi.Float) -> mi.Float:

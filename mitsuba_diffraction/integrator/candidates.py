@@ -16,6 +16,8 @@ It is unbiased for any h and any c > 0, since E[g(ω)/(M π_i)] = ∫ g p (Talbo
 c = M: near lamps directions that are kept are M times as dense as p. β > 0 bounds the weight 1/(M π_i) by 1/β, where
 an obstacle hides the lamp that h expects.
 
+At later vertices, which add little to the noise, there is one slot with half as many candidates.
+
 The first number of `sample` is stratified over all candidates, so that each slot has its own wavelength and each
 candidate its order, whatever the BSDF; the other two follow a lattice with a random shift. Delta components are never
 kept. Their light, and the path, are continued by an ordinary sample (`EyePaths`), which does not count other emitters.
@@ -36,7 +38,7 @@ from ..precomputation.spectra import Spectrum
 from ..spectrum.grids import OrderGrid
 from .unshadowed_light import UnshadowedLight
 
-CANDIDATES = 16  # M
+CANDIDATES, LATER_CANDIDATES = 16, 8  # M, at the first vertex that scatters, and at later ones, which have J = 1
 SLOTS, SLOTS_OF_CONTINUA = 4, 1  # J
 DEFENSIVE_FRACTION = 0.1  # β
 MIN_GAIN = 6.0  # of h by light samples over that in all directions, from which candidates are drawn
@@ -70,7 +72,7 @@ class Candidates:
                 self._bsdfs.append(bsdf)
             table[row] = slots[shape], next(k for k, known in enumerate(self._bsdfs) if bsdf is known)
         self._table = mi.UInt32(table.ravel())
-        self._count, self._fraction = dr.opaque(mi.UInt32, CANDIDATES), opaque(DEFENSIVE_FRACTION)
+        self._fraction = opaque(DEFENSIVE_FRACTION)
 
     def _slots(self, scene: mi.Scene, shape: mi.Shape) -> int:
         """Return J of a shape, zero where lights are about as bright in all directions."""
@@ -94,14 +96,12 @@ class Candidates:
         narrow = all(_has_narrow_lobes(grating.spectrum) for grating in gratings_in(shape.bsdf()))
         return SLOTS if narrow else SLOTS_OF_CONTINUA
 
-    def slots(self, si: mi.SurfaceInteraction3f, active: mi.Bool) -> mi.UInt32:
-        """Return J at a point, zero where no candidates are drawn."""
+    def numbers(self, si: mi.SurfaceInteraction3f, is_later: mi.Bool, active: mi.Bool) -> tuple[mi.UInt32, mi.UInt32]:
+        """Return J and M at a point; J is zero where no candidates are drawn."""
         shape_id = dr.reinterpret_array(mi.UInt32, si.shape)
-        return dr.gather(mi.UInt32, self._table, 2 * shape_id, active & (shape_id < self._size))
-
-    def relative_density(self, slots: mi.UInt32) -> mi.Float:
-        """Return c J."""
-        return mi.Float(slots * self._count)
+        slots = dr.gather(mi.UInt32, self._table, 2 * shape_id, active & (shape_id < self._size))
+        slots = dr.select(is_later & (slots > 0), 1, slots)
+        return slots, dr.select(is_later, mi.UInt32(LATER_CANDIDATES), CANDIDATES)
 
     @dr.syntax
     def sample(
@@ -109,21 +109,29 @@ class Candidates:
         scene: mi.Scene,
         sampler: mi.Sampler,
         si: mi.SurfaceInteraction3f,
-        slots: mi.UInt32,
+        numbers: tuple[mi.UInt32, mi.UInt32],
         probability: mi.Float,
         active: mi.Bool,
     ) -> mi.Spectrum:
-        """Return the light of all slots, the first sum above; `probability` is that of the emitters that are drawn."""
+        """Return the light of all slots, the first sum above.
+
+        Args:
+            scene, sampler, si, active: as in Mitsuba.
+            numbers: J and M.
+            probability: that of the emitters that are drawn.
+        """
         ctx, result, bsdf = mi.BSDFContext(), mi.Spectrum(0), si.bsdf()
         shift, jitter = sampler.next_2d(active), sampler.next_1d(active)
         number = dr.gather(mi.UInt32, self._table, 2 * dr.reinterpret_array(mi.UInt32, si.shape) + 1, active)
-        count, total = mi.Float(self._count), mi.Float(slots * self._count)
+        slots, candidates = numbers
+        count, total = mi.Float(candidates), mi.Float(slots * candidates)
         slot = mi.UInt32(0)
         while active & (slot < slots):
             pick = sampler.next_1d(active)
-            pick = dr.select(sampler.next_1d(active) < self._fraction, mi.UInt32(pick * count), self._count)
-            numbers = (mi.Float(slot * self._count) + jitter) / total, 1 / total, shift, sampler.next_1d(active), pick
-            omega, fraction = self._kept(number, si, numbers, active)
+            pick = dr.select(sampler.next_1d(active) < self._fraction, mi.UInt32(pick * count), candidates)
+            first = (mi.Float(slot * candidates) + jitter) / total
+            of_slot = candidates, first, 1 / total, shift, sampler.next_1d(active), pick
+            omega, fraction = self._kept(number, si, of_slot, active)
             kept = active & (fraction > 0)
             value, pdf = bsdf.eval_pdf(ctx, si, omega, kept)
             kept &= dr.any(value != 0)
@@ -139,28 +147,28 @@ class Candidates:
         return result
 
     def _kept(
-        self, number: mi.UInt32, si: mi.SurfaceInteraction3f, numbers: tuple, active: mi.Bool
+        self, number: mi.UInt32, si: mi.SurfaceInteraction3f, of_slot: tuple, active: mi.Bool
     ) -> tuple[mi.Vector3f, mi.Float]:
         """Return the candidate that is kept, and its h/Σ h; `number` is that of the BSDF in `_bsdfs`.
 
-        `numbers` of a slot: the first number of `sample` for the first candidate, and its step; the shift of the
-        lattice; a random number for the choice by h; the candidate chosen without h, or M.
+        `of_slot`: M; the first number of `sample` for the first candidate, and its step; the shift of the lattice; a
+        random number for the choice by h; the candidate chosen without h, or M.
 
         The BSDFs themselves are called, not `BSDFPtr`: then Dr.Jit leaves out what is computed besides the direction.
         """
         if len(self._bsdfs) == 1:
-            return self._kept_of(self._bsdfs[0], si, numbers, active)
-        return dr.switch(number, [functools.partial(self._kept_of, bsdf) for bsdf in self._bsdfs], si, numbers, active)
+            return self._kept_of(self._bsdfs[0], si, of_slot, active)
+        return dr.switch(number, [functools.partial(self._kept_of, bsdf) for bsdf in self._bsdfs], si, of_slot, active)
 
     @dr.syntax
     def _kept_of(
-        self, bsdf: mi.BSDF, si: mi.SurfaceInteraction3f, numbers: tuple, active: mi.Bool
+        self, bsdf: mi.BSDF, si: mi.SurfaceInteraction3f, of_slot: tuple, active: mi.Bool
     ) -> tuple[mi.Vector3f, mi.Float]:
-        u, step, shift, chosen, pick = numbers
+        candidates, u, step, shift, chosen, pick = of_slot
         ctx, marks_failure = mi.BSDFContext(), _marks_failure(bsdf)
         omega, guess, sum_of_guesses = mi.Vector3f(0, 0, 1), mi.Float(0), mi.Float(0)
         candidate = mi.UInt32(0)
-        while candidate < self._count:
+        while candidate < candidates:
             position = dr.minimum(dr.fma(mi.Float(candidate), step, u), BELOW_ONE)
             bs, _ = bsdf.sample(ctx, si, position, _lattice_point(position / step, shift), active)
             usable = active & ~mi.has_flag(bs.sampled_type, mi.BSDFFlags.Delta)
@@ -172,7 +180,7 @@ class Candidates:
             takes = scaled < h
             scaled = dr.select(takes, scaled / h, (scaled - h) / (sum_of_guesses - h))
             chosen = dr.select(h > 0, scaled, chosen)
-            takes = dr.select(pick < self._count, candidate == pick, takes)
+            takes = dr.select(pick < candidates, candidate == pick, takes)
             omega, guess = dr.select(takes, bs.wo, omega), dr.select(takes, h, guess)
             candidate += 1
         return omega, dr.select(guess > 0, guess / sum_of_guesses, 0)

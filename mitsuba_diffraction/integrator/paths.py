@@ -172,8 +172,9 @@ def define_eye_paths() -> type:
             if dr.hint(draws_wavelengths, mode="scalar"):
                 first_on_grating, _ = self.gratings.classify(si, active)
                 of_lamps = self.lamps.light(scene, sampler, si, first_on_grating)
-            # Whether an earlier vertex is not on a grating; whether the first vertex is on one or scatters specularly.
-            has_other_vertex, from_eye_only = mi.Bool(False), mi.Bool(False)
+            # Whether an earlier vertex is not on a grating; whether the first vertex is on one or scatters specularly;
+            # whether an earlier vertex does not.
+            has_other_vertex, from_eye_only, has_scattered = mi.Bool(False), mi.Bool(False), mi.Bool(False)
             while active:
                 bsdf = si.bsdf(ray)
                 on_grating, grating_only = self.gratings.classify(si, active)
@@ -199,14 +200,14 @@ def define_eye_paths() -> type:
                 emitted *= probability
                 wo = si.to_local(ds.d)
                 value, pdf = bsdf.eval_pdf(ctx, si_bsdf, wo, samples_emitter & (ds.pdf != 0))
-                slots = self.candidates.slots(si, on_grating & samples_emitter)
+                slots, candidates = self.candidates.numbers(si, has_scattered, on_grating & samples_emitter)
                 mis_weight = _power_heuristic(ds.pdf, bsdf_probability * pdf)
-                of_candidates = self.candidates.relative_density(slots) * pdf
+                of_candidates = mi.Float(slots * candidates) * pdf
                 mis_weight = dr.select(slots > 0, quotient(ds.pdf, ds.pdf + of_candidates), mis_weight)
                 mis_weight = dr.select(ds.delta, 1, mis_weight)
                 result += dr.select(samples_emitter & (ds.pdf != 0), throughput * value * emitted * mis_weight, 0)
                 if dr.hint(self.candidates.any, mode="scalar"):
-                    light = self.candidates.sample(scene, sampler, si_bsdf, slots, probability, slots > 0)
+                    light = self.candidates.sample(scene, sampler, si_bsdf, (slots, candidates), probability, slots > 0)
                     result += dr.select(slots > 0, throughput * light, 0)
 
                 # BSDF sampling, or the direction to a point on a grating; the next ray may hit an emitter.
@@ -228,6 +229,7 @@ def define_eye_paths() -> type:
                 active &= ~is_last | delta
                 from_eye_only |= (depth == 1) & (delta | on_grating)
                 has_other_vertex |= on_grating ^ True
+                has_scattered |= ~delta
                 ray = si.spawn_ray(dr.select(guided, to_point.d, si.to_world(bs.wo)))
                 next_si = scene.ray_intersect(ray, active)
                 ds = mi.DirectionSample3f(scene, next_si, si)

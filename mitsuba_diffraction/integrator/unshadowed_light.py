@@ -17,7 +17,7 @@ import mitsuba as mi
 import numpy as np
 from numpy.typing import NDArray
 
-from ..bsdf.device_tables import PacketTable, integer_part, larger, limited, opaque, smaller
+from ..bsdf.device_tables import integer_part, larger, limited, opaque, smaller
 
 MAX_OUTLINES = 12
 MARGIN = 1.01  # of outlines, against rounding at their edges
@@ -44,58 +44,56 @@ class UnshadowedLight:
         environment = scene.environment()
         self.has_extent = bool(lamps) or environment is not None
         groups = _groups(np.array([_bounds(shape) for shape in lamps]).reshape(-1, 2, 3))
-        records = [
-            _record(
-                _outline([lamps[k] for k in group]), radiance[group].max(), int(_is_flat([lamps[k] for k in group]))
-            )
-            for group in groups
-        ]
-        self._kinds = {int(record[13]) for record in records}
-        self._count = dr.opaque(mi.UInt32, len(records))
-        self._records = PacketTable(np.array(records or [[0.0] * 16], np.float32))
+        self._outlines = [_Outline([lamps[k] for k in group], radiance[group].max()) for group in groups]
         self._map = None if environment is None else _environment_map(environment)
         brightest = radiance.max(initial=0.0)
         if self._map is not None:
             brightest = max(brightest, float(dr.mean(self._map)[0]))
         self._min = opaque(MIN_RADIANCE * brightest if brightest > 0 else 1.0)
 
-    @dr.syntax
     def __call__(self, point: mi.Point3f, omega: mi.Vector3f, active: mi.Bool) -> mi.Float:
         """Return h(p, ω) > 0, in the unit of radiance."""
         result = mi.Float(0)
-        if dr.hint(self._map is not None, mode="scalar"):
-            result += dr.gather(mi.Float, self._map, _octahedral_cell(omega), active)
-        if dr.hint(len(self._kinds) > 0, mode="scalar"):
-            lamp = mi.UInt32(0)
-            while lamp < self._count:
-                result += self._of_outline(lamp, point, omega, active)
-                lamp += 1
+        if self._map is not None:
+            is_uniform = dr.width(self._map) == 1
+            result += self._map if is_uniform else dr.gather(mi.Float, self._map, _octahedral_cell(omega), active)
+        # No loop: what depends on the point alone is then computed once for all directions.
+        for outline in self._outlines:
+            result += dr.select(outline.meets(point, omega), outline.radiance, 0)
         return larger(result, self._min)
 
-    def _of_outline(self, lamp: mi.UInt32, point: mi.Point3f, omega: mi.Vector3f, active: mi.Bool) -> mi.Float:
-        """Return the radiance of a lamp whose outline the ray meets, else zero."""
-        rows = [self._records(4 * lamp + k, active) for k in range(4)]
-        # In the coordinates of the lamp its outline is |x|, |y|, |z| ≤ 1, or |x, y, z| ≤ 1; if flat, |z| ≤ 0.
-        o = mi.Vector3f([dr.fma(r[0], point.x, dr.fma(r[1], point.y, dr.fma(r[2], point.z, r[3]))) for r in rows[:3]])
-        d = mi.Vector3f([dr.fma(r[0], omega.x, dr.fma(r[1], omega.y, r[2] * omega.z)) for r in rows[:3]])
-        radiance, kind, half_thickness = rows[3][0], rows[3][1], rows[3][2]
-        meets = mi.Bool(False)
-        if self._kinds & {_BOX, _DISK}:
-            inverse = dr.rcp(dr.select(dr.abs(d) > 1e-20, d, 1e-20))
-            half = mi.Vector3f(1, 1, half_thickness)
-            first, last = (-half - o) * inverse, (half - o) * inverse
-            near, far = mi.Vector3f(*map(smaller, first, last)), mi.Vector3f(*map(larger, first, last))
-            within = smaller(smaller(far.x, far.y), far.z) >= larger(larger(near.x, near.y), larger(near.z, 0))
-            # A flat lamp emits at its front only.
-            in_front = (half_thickness > 0) | (o.z > 0)
-            meets |= in_front & within & (kind == _BOX)
-            if _DISK in self._kinds:
-                x, y = dr.fma(far.z, d.x, o.x), dr.fma(far.z, d.y, o.y)
-                meets |= in_front & (far.z > 0) & (x * x + y * y <= 1) & (kind == _DISK)
-        if _SPHERE in self._kinds:
+
+class _Outline:
+    """An outline around some lamps, and the maximum of their radiances.
+
+    In its coordinates it is |x|, |y|, |z| ≤ 1, or x² + y² ≤ 1 and z = 0, or |x, y, z| ≤ 1. A rectangle has z = 0, too.
+
+    Attributes:
+        radiance: an opaque number.
+    """
+
+    def __init__(self, lamps: list[mi.Shape], radiance: float) -> None:
+        self.radiance, self._is_flat = opaque(radiance), _is_flat(lamps)
+        self._kind, centre, axes = _outline(lamps)
+        to_lamp = np.linalg.inv(axes * MARGIN)
+        self._rows = [[opaque(x) for x in row] for row in np.column_stack([to_lamp, -to_lamp @ centre])]
+
+    def meets(self, point: mi.Point3f, omega: mi.Vector3f) -> mi.Bool:
+        """Return whether the ray from p along ω meets the outline; a flat lamp only at its front, which emits."""
+        o = mi.Vector3f([dr.fma(x, point.x, dr.fma(y, point.y, dr.fma(z, point.z, of))) for x, y, z, of in self._rows])
+        d = mi.Vector3f([dr.fma(x, omega.x, dr.fma(y, omega.y, z * omega.z)) for x, y, z, _ in self._rows])
+        if self._kind == _SPHERE:
             a, b, c = dr.squared_norm(d), dr.dot(o, d), dr.squared_norm(o) - 1
-            meets |= ((c <= 0) | ((b < 0) & (b * b >= a * c))) & (kind == _SPHERE)
-        return dr.select(meets, radiance, 0)
+            return (c <= 0) | ((b < 0) & (b * b >= a * c))
+        if self._is_flat:
+            t = -o.z / d.z
+            x, y = dr.fma(t, d.x, o.x), dr.fma(t, d.y, o.y)
+            within = x * x + y * y <= 1 if self._kind == _DISK else larger(dr.abs(x), dr.abs(y)) <= 1
+            return within & (o.z > 0) & (t > 0)
+        inverse = dr.rcp(dr.select(dr.abs(d) > 1e-20, d, 1e-20))
+        first, last = (-1 - o) * inverse, (1 - o) * inverse
+        near, far = mi.Vector3f(*map(smaller, first, last)), mi.Vector3f(*map(larger, first, last))
+        return smaller(smaller(far.x, far.y), far.z) >= larger(larger(near.x, near.y), larger(near.z, 0))
 
 
 def _radiance(scene: mi.Scene, lamps: list[mi.Shape]) -> NDArray[np.float64]:
@@ -159,14 +157,6 @@ def _outline(lamps: list[mi.Shape]) -> tuple[int, NDArray[np.float64], NDArray[n
     return kind, (low + high) / 2, np.diag(np.maximum(half, 1e-4 * half.max()))
 
 
-def _record(outline: tuple[int, NDArray[np.float64], NDArray[np.float64]], radiance: float, flat: int) -> list[float]:
-    """Return the map to the coordinates of a lamp by rows, its radiance, its kind, and its half thickness there."""
-    kind, centre, axes = outline
-    to_lamp = np.linalg.inv(axes * MARGIN)
-    rows = np.column_stack([to_lamp, -to_lamp @ centre])
-    return [*rows.ravel(), radiance, kind, 1 - flat, 0]
-
-
 def _octahedral_cell(omega: mi.Vector3f) -> mi.UInt32:
     """Return the index of the cell of a direction: the octahedron |x| + |y| + |z| = 1, its lower half folded out."""
     scale = dr.rcp(dr.abs(omega.x) + dr.abs(omega.y) + dr.abs(omega.z))
@@ -179,7 +169,7 @@ def _octahedral_cell(omega: mi.Vector3f) -> mi.UInt32:
 
 
 def _environment_map(environment: mi.Emitter) -> mi.Float:
-    """Return the maxima of the radiance over the cells of the octahedral map and their neighbours."""
+    """Return the maxima of the radiance over the cells of the octahedral map and their neighbours, or one for all."""
     side = MAP_SIDE * _PER_CELL
     index = dr.arange(mi.UInt32, side**2)
     u, v = ((mi.Float(k) + 0.5) * (2 / side) - 1 for k in (index % side, index // side))
@@ -198,7 +188,8 @@ def _environment_map(environment: mi.Emitter) -> mi.Float:
         dr.scatter_reduce(dr.ReduceOp.Max, maxima, _mean(environment.eval(si)), _octahedral_cell(omega))
     cells = _folded_out(np.array(maxima).reshape(MAP_SIDE, MAP_SIDE))
     around = [cells[j : j + MAP_SIDE, i : i + MAP_SIDE] for j in range(3) for i in range(3)]
-    return mi.Float(np.max(around, axis=0).ravel())
+    result = np.max(around, axis=0).ravel()
+    return mi.Float(result) if np.ptp(result) > 1e-6 * result.max() else opaque(result.max())
 
 
 def _folded_out(cells: NDArray[np.float32]) -> NDArray[np.float32]:

@@ -25,6 +25,7 @@ import mitsuba_diffraction as md
 from mitsuba_diffraction import testing
 from mitsuba_diffraction.bsdf.continuum_sampler import BinSampler
 from mitsuba_diffraction.bsdf.directions import Incidence, Interface
+from mitsuba_diffraction.bsdf.inversion import AliasTable
 from mitsuba_diffraction.bsdf.order_sampler import OrderSampler
 
 SKINS = "elaphe", "xenopeltis"  # slow to build
@@ -291,6 +292,24 @@ def test_continua_are_drawn_with_their_density_and_propagate(llvm, name, theta, 
     # Points resolve densities, which jump at the borders of bins, to a per cent.
     chi_square = ((found - wanted) ** 2 / (wanted + (0.01 * wanted) ** 2)).sum()
     assert abs(chi_square - len(found)) < 4 * np.sqrt(2 * len(found))
+
+
+def test_an_alias_table_draws_with_the_given_probabilities(llvm):
+    """Equidistant numbers draw each index in proportion to its weight, and what is left of a number is uniform."""
+    rng, count = np.random.default_rng(5), 1 << 20
+    weights = rng.random((6, 37)) ** [[0], [1], [4], [20], [1], [1]]
+    weights[4] = np.arange(37) == 30
+    weights[5] = 0
+    table = AliasTable(weights)
+    weights[5] = 1
+    u = (np.arange(count) + 0.5) / count
+    for distribution, of_each in enumerate(weights):
+        index, rest = table.draw(mi.UInt32(distribution), floats(u), mi.Bool(True))
+        found = np.bincount(np.array(index), minlength=37) / count
+        np.testing.assert_allclose(found, of_each / of_each.sum(), atol=3 / count * 37)
+        middles = np.bincount(np.array(index), np.array(rest, np.float64), 37) / count
+        np.testing.assert_allclose(middles, found / 2, atol=1e-4)
+        assert 0 <= float(dr.min(rest)[0]) <= float(dr.max(rest)[0]) < 1
 
 
 @pytest.mark.parametrize("name", ["blazed", "column", "crossed"])

@@ -154,7 +154,7 @@ def test_the_guess_is_nowhere_below_the_radiance(name, llvm):
 
 
 def test_sixty_lamps_have_twelve_outlines(llvm):
-    assert int(UnshadowedLight(scene({"type": "diffuse"}, **many_lamps()))._count[0]) == 12
+    assert len(UnshadowedLight(scene({"type": "diffuse"}, **many_lamps()))._outlines) == 12
 
 
 def two_lamps(side=1):
@@ -258,16 +258,19 @@ FIREFLIES = {
 @pytest.mark.parametrize("name", FIREFLIES)
 def test_no_pixel_stands_out_more_than_with_path(name, llvm):
     """One ray: the mean is that of `path`, and the largest of many pixels of 16 samples is not further above it."""
-    depth = 4
+    depth, ratios = 4, []
     built = scene(surface(), **FIREFLIES[name]())
     path = mi.load_dict({"type": "path", "max_depth": depth})
-    wanted, found = (samples(built, of, 2**19) for of in (path, eye_paths(built, depth)))
-    errors = [each.std(axis=1, ddof=1) / np.sqrt(each.shape[1]) for each in (wanted, found)]
-    np.testing.assert_array_less(np.abs(found.mean(axis=1) - wanted.mean(axis=1)), 4 * np.hypot(*errors) + 1e-9)
-    pixels = [each.mean(axis=0).reshape(-1, 16).mean(axis=1) for each in (wanted, found)]
-    largest = [each.max() / each.mean() for each in pixels]
-    assert largest[1] < 1.1 * largest[0], largest
-    assert pixels[1].var() < 1.1 * pixels[0].var()
+    # The largest of one seed varies by a third.
+    for seed in range(4):
+        wanted, found = (samples(built, of, 2**19, seed) for of in (path, eye_paths(built, depth)))
+        errors = [each.std(axis=1, ddof=1) / np.sqrt(each.shape[1]) for each in (wanted, found)]
+        np.testing.assert_array_less(np.abs(found.mean(axis=1) - wanted.mean(axis=1)), 4 * np.hypot(*errors) + 1e-9)
+        pixels = [each.mean(axis=0).reshape(-1, 16).mean(axis=1) for each in (wanted, found)]
+        ratios.append([(each.max() / each.mean(), each.var()) for each in pixels])
+    (largest, variance), (largest_found, variance_found) = np.mean(ratios, axis=0)
+    assert largest_found < 1.1 * largest, ratios
+    assert variance_found < 1.1 * variance, ratios
 
 
 def assert_bins_agree(name, depth):
