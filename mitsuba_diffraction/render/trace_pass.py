@@ -11,6 +11,7 @@ Four wavelengths contribute to at most eight of the hat-shaped channels; a `spec
 from __future__ import annotations
 
 import functools
+import operator
 import tempfile
 from bisect import bisect_right
 from collections.abc import Callable
@@ -422,6 +423,24 @@ def collect(
     stride, last_x = inner + 2 * sides, inner + sides
     first_y, last_y = dr.opaque(mi.Int32, -above), dr.opaque(mi.Int32, rows + below)
 
+    def add_light(
+        channel: list[mi.Float],
+        value: list[mi.Float],
+        filter_weight: mi.Vector4f,
+        index: mi.UInt32,
+        base: mi.UInt32,
+        active: mi.Bool,
+    ) -> None:
+        for of_channel, of_value in zip(channel, value, strict=True):
+            fractional = dr.gather(mi.Float, of_channel, index, active)
+            weighted = of_value * filter_weight
+            lower = dr.floor(fractional)
+            upper_weight = fractional - lower
+            k = mi.Int32(lower)
+            for target, part in ((k, weighted * (1 - upper_weight)), (k + 1, weighted * upper_weight)):
+                exists = active & (target >= 0) & (target < channels)
+                add(part, base + mi.UInt32(target) * across, exists)
+
     weight = dr.zeros(mi.Vector4f, rows * groups)
     width = 2 * kernel_radius + _GROUP
     tap = mi.UInt32(0)
@@ -437,15 +456,16 @@ def collect(
                 offset_y = mi.Float(y) + 0.5 - dr.gather(mi.Float, position.y, index, inside)
                 of_row = rfilter.eval(offset_y, inside)
                 filter_weight = mi.Vector4f([rfilter.eval(offset_x + k, inside) * of_row for k in range(_GROUP)])
-            for i in range(len(channel)):
-                fractional = dr.gather(mi.Float, channel[i], index, inside)
-                weighted = dr.gather(mi.Float, value[i], index, inside) * filter_weight
-                lower = dr.floor(fractional)
-                upper_weight = fractional - lower
-                k = mi.Int32(lower)
-                for target, part in ((k, weighted * (1 - upper_weight)), (k + 1, weighted * upper_weight)):
-                    exists = inside & (target >= 0) & (target < channels)
-                    add(part, base + mi.UInt32(target) * across, exists)
+            for first in range(0, len(channel), 4):
+                channels_of_light = channel[first : first + 4]
+                values = [dr.gather(mi.Float, of, index, inside) for of in value[first : first + 4]]
+                if dr.hint(first == 0, mode="scalar"):
+                    add_light(channels_of_light, values, filter_weight, index, base, inside)
+                else:
+                    # Few samples of most pictures have light of lamps without extent.
+                    lit = functools.reduce(operator.or_, (of_sample != 0 for of_sample in values))
+                    if lit:
+                        add_light(channels_of_light, values, filter_weight, index, base, lit)
             weight += dr.select(inside, filter_weight, 0)
             index += 1
         tap += 1

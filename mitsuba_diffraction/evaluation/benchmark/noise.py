@@ -85,7 +85,7 @@ def measure_noise(
     scenes: Sequence[str | os.PathLike[str]] = (),
     *,
     depths: Sequence[int] = DEPTHS,
-    width: int = 96,
+    width: int = 192,
     samples: int = 32,
     pictures: int = 4,
     progress: Progress = silent,
