@@ -135,7 +135,8 @@ def _write_orders(title: str, recipe: Recipe, parameters: dict[str, Any], output
         else:
             write_lswm(grating, output, wavelengths, angles, azimuths, progress)
             sides = "from both sides" if grating.transmits else "from above"
-            what = f"{len(wavelengths)} wavelengths × {len(angles)} × {len(azimuths)} directions of light {sides}"
+            unit = "wavelength" if len(wavelengths) == 1 else "wavelengths"
+            what = f"{len(wavelengths)} {unit} × {len(angles)} × {len(azimuths)} directions of light {sides}"
     warning = scalar_error(grating.height_field).warning if grating.theory == "scalar" else ""
     if warning:
         tell(f"! {warning}")

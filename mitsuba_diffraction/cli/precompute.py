@@ -92,9 +92,15 @@ def _seam(source: Path, recipe: Recipe) -> str:
         f"{across * 1e3:.3g} nm along {axis} ({inside * 1e3:.3g} inside)" for axis, (across, inside) in steps.items()
     )
     if is_seam_visible(steps):
+        ways = [
+            "extent=sample (a sample of an irregular surface)",
+            "extent=tile (periodic, in spite of the seam)",
+            "prepare=crop_periods (a grating, cropped to whole periods)",
+        ]
+        if any("crop_periods" in step for step in recipe.surface.get("prepare", ())):
+            ways.pop()
         raise RequestError(
             f"extent: got none, and {source} does not tile without a seam: r.m.s. steps of {seam}; wanted "
-            "extent=sample (a sample of an irregular surface), extent=tile (periodic, in spite of the seam), or "
-            "prepare=crop_periods (a grating, cropped to whole periods)"
+            f"{', '.join(ways[:-1])} or {ways[-1]}"
         )
     return f"\nrepeated as a tile; r.m.s. steps at the seam {seam}" if seam else ""

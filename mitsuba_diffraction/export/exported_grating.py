@@ -89,8 +89,8 @@ class ExportedGrating:
         """
         if recipe.settings.extent == "sample" or recipe.patches > 1:
             raise RequestError(
-                f"{name}: got an irregular surface, which has no orders, wanted a grating; `efficiency {name} --csv "
-                "FILE.csv` tabulates its peaks, and a file .osl holds its spectrum"
+                f"{name}: got an irregular surface, which has no orders, wanted a grating; the command `efficiency "
+                "--csv` tabulates its peaks, and a file .osl holds its spectrum"
             )
         field = recipe.height_field()
         if is_profile(field):

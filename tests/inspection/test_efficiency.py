@@ -261,9 +261,10 @@ def test_a_recipe_of_a_grating_below_a_coat_is_refused_as_orders_are_in_air(comm
         code, said, error = command(line.replace("SURFACE", str(recipe)))
         assert (code, said) == (2, "")
         assert "ext_ior: got 1.5 of the recipe, wanted none: these orders are in air" in error
-    code, _, error = command("efficiency lamellar,period=2,depth=0.1,theory=rigorous,ext_ior=1.4 --wavelength 550")
-    assert code == 2
-    assert "ext_ior: got 1.4 of the recipe, wanted none: these orders are in air" in error
+    for theory in ("", ",theory=scalar", ",theory=rigorous"):
+        code, _, error = command(f"efficiency lamellar,period=2,depth=0.1,ext_ior=1.4{theory} --wavelength 550")
+        assert code == 2
+        assert "ext_ior: got 1.4 of the recipe, wanted none: these orders are in air" in error
 
 
 def test_the_command_takes_theory_and_material_of_a_recipe(command):
