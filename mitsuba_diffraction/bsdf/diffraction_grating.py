@@ -184,6 +184,9 @@ def refuse_wrong(props: mi.Properties) -> None:
     # `profile_name` refuses unknown profiles.
     known = {*types, *(parameters_of_profile(profile) if is_known else ())}
     if (profile is None or is_known) and (unknown := sorted(set(props.keys()) - known - nested)):
+        of_profiles = [name for name in PROFILES if profile is None and unknown[0] in parameters_of_profile(name)]
+        if of_profiles:
+            raise RequestError(f"{unknown[0]}: got it without profile, wanted it with one of {', '.join(of_profiles)}")
         similar = did_you_mean(unknown[0], known)
         raise RequestError(f"{', '.join(unknown)}: unknown, wanted one of {', '.join(sorted(known))}{similar}")
     for name in props.keys():  # noqa: SIM118

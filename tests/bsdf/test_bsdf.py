@@ -235,6 +235,7 @@ def test_variant_without_wavelengths_is_refused():
 @pytest.mark.parametrize(
     ("parameters", "text"),
     [
+        ({"period": 2.0}, "period: got it without profile, wanted it with one of blazed, "),
         ({"hight_scale": 1.0}, "hight_scale: unknown, wanted one of base, .*; did you mean height_scale"),
         ({"shadowing": "smith"}, "shadowing"),
         ({"fresnel": "exact"}, "fresnel"),
