@@ -56,10 +56,19 @@ class Candidates:
         any: whether candidates are drawn on any of the shapes.
     """
 
-    def __init__(self, scene: mi.Scene, shapes: list[mi.Shape]) -> None:
+    def __init__(self, scene: mi.Scene, shapes: list[mi.Shape], instanced: list[mi.Shape]) -> None:
+        """Choose J of all gratings.
+
+        Args:
+            scene: with lights.
+            shapes: on which points can be drawn.
+            instanced: of groups, whose instances are in the scene.
+        """
         self.light = UnshadowedLight(scene)
-        slots = {shape: self._slots(scene, shape) for shape in shapes}
-        shapes = [shape for shape in shapes if slots[shape]]
+        u = mi.Point2f(_random(_DIRECTIONS).x, _random(_DIRECTIONS).y)
+        slots = {shape: self._slots(scene, shape, shape.sample_position(0.0, u).p) for shape in shapes}
+        slots |= {shape: self._slots(scene, shape, _points_of_instances(scene)) for shape in instanced}
+        shapes = [shape for shape in slots if slots[shape]]
         self.any = bool(shapes)
         self._bsdfs: list[mi.BSDF] = []
         ids = [dr.reinterpret_array(mi.UInt32, mi.ShapePtr(shape))[0] for shape in shapes]
@@ -74,24 +83,24 @@ class Candidates:
         self._table = mi.UInt32(table.ravel())
         self._fraction = opaque(DEFENSIVE_FRACTION)
 
-    def _slots(self, scene: mi.Scene, shape: mi.Shape) -> int:
-        """Return J of a shape, zero where lights are about as bright in all directions."""
+    def _slots(self, scene: mi.Scene, shape: mi.Shape, points: mi.Point3f) -> int:
+        """Return J of a shape with these points, zero where lights are about as bright in all directions."""
         if not self.light.has_extent:
             return 0
-        rng = mi.PCG32(size=_DIRECTIONS)
+        rng = mi.PCG32(size=_DIRECTIONS, initseq=1)
 
         def number() -> mi.Float:
             return mi.Float(rng.next_float32())
 
-        at = shape.sample_position(0.0, mi.Point2f(number(), number()))
-        si = mi.SurfaceInteraction3f(at, dr.zeros(mi.Spectrum))
+        si = dr.zeros(mi.SurfaceInteraction3f, _DIRECTIONS)
+        si.p = points
         drawn, _ = scene.sample_emitter_direction(si, mi.Point2f(number(), number()), False)
         has_extent = (drawn.pdf > 0) & ~drawn.delta
         anywhere = mi.warp.square_to_uniform_sphere(mi.Point2f(number(), number()))
-        of_lights = dr.sum(dr.select(has_extent, self.light(at.p, drawn.d, True), 0)) / dr.maximum(
+        of_lights = dr.sum(dr.select(has_extent, self.light(si.p, drawn.d, True), 0)) / dr.maximum(
             dr.count(has_extent), 1
         )
-        if float(of_lights[0]) < MIN_GAIN * float(dr.mean(self.light(at.p, anywhere, True))[0]):
+        if float(of_lights[0]) < MIN_GAIN * float(dr.mean(self.light(si.p, anywhere, True))[0]):
             return 0
         narrow = all(_has_narrow_lobes(grating.spectrum) for grating in gratings_in(shape.bsdf()))
         return SLOTS if narrow else SLOTS_OF_CONTINUA
@@ -184,6 +193,24 @@ class Candidates:
             omega, guess = dr.select(takes, bs.wo, omega), dr.select(takes, h, guess)
             candidate += 1
         return omega, dr.select(guess > 0, guess / sum_of_guesses, 0)
+
+
+def _random(count: int) -> mi.Point3f:
+    """Return points in the unit cube, always the same."""
+    rng = mi.PCG32(size=count)
+    return mi.Point3f(*(mi.Float(rng.next_float32()) for _ in range(3)))
+
+
+def _points_of_instances(scene: mi.Scene) -> mi.Point3f:
+    """Return points in the boxes around all instances, as Mitsuba does not draw points on them."""
+    boxes = [shape.bbox() for shape in scene.shapes() if shape.class_name() == "Instance"]
+    low, high = (
+        mi.Point3f(np.array(corners, np.float32).T)
+        for corners in zip(*((box.min, box.max) for box in boxes), strict=True)
+    )
+    which = dr.arange(mi.UInt32, _DIRECTIONS) % len(boxes)
+    low, high = (dr.gather(mi.Point3f, corner, which) for corner in (low, high))
+    return low + (high - low) * _random(_DIRECTIONS)
 
 
 def _marks_failure(bsdf: mi.BSDF) -> bool:

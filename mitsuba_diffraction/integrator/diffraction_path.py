@@ -56,9 +56,11 @@ finds much of this light in the picture, to 64, where it finds little; the numbe
 `path`, a light without extent is not seen in a mirror: it is omitted where the grating next to it scatters by a delta
 component.
 
+Instances and curves count as X, but direct light at an instance is drawn as that at a grating.
+
 Without a grating, with max_depth of 0 or 1, in polarised variants, and for sensors other than `perspective` and
 `thinlens`, this is `path`. So it is with max_depth of 2 where all lights have an extent and are about as bright in all
-directions. Instances and curves count as X. hide_emitters, and films with sample_border, are refused.
+directions. hide_emitters, and films with sample_border, are refused.
 It can be nested in `aov`. Gradients are computed by `path` (forward) and `prb` (backward), single rays (`sample`) by
 `path`.
 """
@@ -84,7 +86,7 @@ def define() -> type:
             if gratings is None:
                 return self.path, None
             eye = eye_class(scene, sensor, gratings, self.max_depth, self.rr_depth)
-            if 0 <= self.max_depth < 3:
+            if 0 <= self.max_depth < 3 or not gratings.shapes:
                 return (eye if eye.candidates.any or eye.lamps.any else self.path), None
             if all(shape in gratings or _is_black(shape.bsdf()) for shape in scene.shapes()):
                 return eye, None
@@ -162,10 +164,10 @@ def _lit_gratings(scene: mi.Scene, sensor: mi.Sensor, max_depth: int) -> Grating
     if not implements(sensor.sample_direction, dr.zeros(mi.SurfaceInteraction3f), mi.Point2f(0.5)):
         return None
     gratings = Gratings(scene)
-    if not gratings.shapes or not scene.emitters():
+    if not (gratings.shapes or gratings.instanced) or not scene.emitters():
         return None
     film = sensor.film()
-    if film.sample_border() and film.rfilter().border_size() > 0:
+    if gratings.shapes and film.sample_border() and film.rfilter().border_size() > 0:
         raise RequestError(
             "sample_border: got true, wanted false: points outside the film's edge cannot be connected to it"
         )

@@ -39,17 +39,23 @@ class Gratings:
 
     Attributes:
         shapes: list of `mi.Shape`.
+        instanced: those of groups, whose instances do not count.
     """
 
     def __init__(self, scene: mi.Scene) -> None:
         areas = [(shape, _area(shape)) for shape in scene.shapes() if gratings_in(shape.bsdf())]
         areas = [(shape, area) for shape, area in areas if area > 0]
         self.shapes = [shape for shape, _ in areas]
-        if not self.shapes:
+        has_instances = any(shape.class_name() == "Instance" for shape in scene.shapes())
+        groups = [shape for shape in parts(scene, mi.Shape) if shape.class_name() == "ShapeGroupPlugin"]
+        members = [shape for group in groups for shape in parts(group, mi.Shape) if has_instances]
+        self.instanced = [shape for shape in members if gratings_in(shape.bsdf())]
+        if self.shapes:
+            self._choice = mi.DiscreteDistribution([area for _, area in areas])
+        ids = [dr.reinterpret_array(mi.UInt32, mi.ShapePtr(shape))[0] for shape in (*self.shapes, *self.instanced)]
+        if not ids:
             return
-        self._choice = mi.DiscreteDistribution([area for _, area in areas])
-        ids = [dr.reinterpret_array(mi.UInt32, mi.ShapePtr(shape))[0] for shape in self.shapes]
-        kinds = [2 if _is_grating_only(shape.bsdf()) else 1 for shape in self.shapes]
+        kinds = [2 if _is_grating_only(shape.bsdf()) else 1 for shape in self.shapes] + [3] * len(self.instanced)
         self._size = dr.opaque(mi.UInt32, max(ids) + 1)
         self._table = dr.zeros(mi.UInt32, max(ids) + 1)
         dr.scatter(self._table, mi.UInt32(kinds), mi.UInt32(ids))
@@ -64,12 +70,21 @@ class Gratings:
         Such a BSDF (a grating, or a `twosided` of gratings) is reciprocal, and its wavelengths can be replaced, as no
         other BSDF receives them.
         """
+        kind = self._kind(si, active)
+        return (kind == 1) | (kind == 2), kind == 2
+
+    def contains(self, si: mi.SurfaceInteraction3f, active: mi.Bool) -> mi.Bool:
+        """Return whether a point lies on one of the shapes or on an instance of those of groups."""
+        return self._kind(si, active) > 0
+
+    def _kind(self, si: mi.SurfaceInteraction3f, active: mi.Bool) -> mi.UInt32:
         shape_id = dr.reinterpret_array(mi.UInt32, si.shape)
-        kind = dr.gather(mi.UInt32, self._table, shape_id, active & (shape_id < self._size))
-        return kind > 0, kind == 2
+        return dr.gather(mi.UInt32, self._table, shape_id, active & (shape_id < self._size))
 
     def sample(self, time: mi.Float, u: mi.Float, v: mi.Point2f, active: mi.Bool) -> mi.PositionSample3f:
         """Sample a point on the shapes, uniformly by area; `pdf` is the density per unit area."""
+        if not self.shapes:
+            return dr.zeros(mi.PositionSample3f)
         index, probability = self._choice.sample_pmf(u, active)
         # A call via mi.ShapePtr would also be recorded for shapes that do not implement it.
         point = dr.switch(index, [shape.sample_position for shape in self.shapes], time, v, active)
@@ -78,6 +93,8 @@ class Gratings:
 
     def pdf_direction(self, si: mi.SurfaceInteraction3f, ray: mi.Ray3f) -> mi.Float:
         """Return the density of `sample` per unit solid angle, of a point that a ray hits."""
+        if not self.shapes:
+            return mi.Float(0)
         return quotient(dr.square(si.t), self._choice.sum() * dr.abs(dr.dot(si.n, ray.d)))
 
 
@@ -121,10 +138,11 @@ def define_eye_paths() -> type:
             self, scene: mi.Scene, sensor: mi.Sensor, gratings: Gratings, max_depth: int, rr_depth: int
         ) -> None:
             mi.SamplingIntegrator.__init__(self, mi.Properties("eye_paths"))
-            self.gratings, self.candidates = gratings, Candidates(scene, gratings.shapes)
+            self.gratings = gratings
+            self.candidates = Candidates(scene, gratings.shapes, gratings.instanced)
             self.lamps = LampsWithoutExtent(scene, sensor)
             # Whether L G X G E and L G X M E are short enough: a literal, which removes what serves them alone.
-            self.guides = not 0 <= max_depth < 4
+            self.guides = bool(gratings.shapes) and not 0 <= max_depth < 4
             # Opaque, so that all depths run the same kernel.
             self.max_depth = dr.opaque(mi.UInt32, max_depth % 2**32)
             self.rr_depth = dr.opaque(mi.UInt32, rr_depth)
@@ -170,7 +188,7 @@ def define_eye_paths() -> type:
             depth = mi.UInt32(1)
             active &= si.is_valid() & (depth < self.max_depth)
             if dr.hint(draws_wavelengths, mode="scalar"):
-                first_on_grating, _ = self.gratings.classify(si, active)
+                first_on_grating = self.gratings.contains(si, active)
                 of_lamps = self.lamps.light(scene, sampler, si, first_on_grating)
             # Whether an earlier vertex is not on a grating; whether the first vertex is on one or scatters specularly;
             # whether an earlier vertex does not.
@@ -193,14 +211,14 @@ def define_eye_paths() -> type:
                 # That of the emitters of which one is drawn.
                 probability = mi.Float(1)
                 if dr.hint(draws_wavelengths, mode="scalar"):
-                    point, probability, has_other = self.lamps.others(point, on_grating & (depth == 1))
+                    point, probability, has_other = self.lamps.others(point, first_on_grating & (depth == 1))
                     samples_emitter &= has_other
                 ds, emitted = scene.sample_emitter_direction(si, point, True, samples_emitter)
                 ds.pdf /= probability
                 emitted *= probability
                 wo = si.to_local(ds.d)
                 value, pdf = bsdf.eval_pdf(ctx, si_bsdf, wo, samples_emitter & (ds.pdf != 0))
-                slots, candidates = self.candidates.numbers(si, has_scattered, on_grating & samples_emitter)
+                slots, candidates = self.candidates.numbers(si, has_scattered, samples_emitter)
                 mis_weight = _power_heuristic(ds.pdf, bsdf_probability * pdf)
                 of_candidates = mi.Float(slots * candidates) * pdf
                 mis_weight = dr.select(slots > 0, quotient(ds.pdf, ds.pdf + of_candidates), mis_weight)

@@ -200,6 +200,25 @@ def test_light_of_lamps_is_the_sum_over_their_points(name, llvm):
     np.testing.assert_array_less(np.abs(found - wanted), 4 * error + 1e-3 * wanted.max())
 
 
+def test_instances_draw_candidates(llvm):
+    """A plate of a group, which an instance moves to the origin, beside a group without gratings."""
+    groups = {"plate": surface(), "paint": {"type": "diffuse"}}
+    parts = {}
+    for k, (name, bsdf) in enumerate(groups.items()):
+        member = {"type": "rectangle", "to_world": at(3, 0, 0), "bsdf": bsdf}
+        parts[name] = {"type": "shapegroup", "member": member}
+        to_world = at(-3, 2.5 * k, 0)
+        parts[f"{name} moved"] = {"type": "instance", "to_world": to_world, "group": {"type": "ref", "id": name}}
+    built = mi.load_dict({"type": "scene", **parts, **two_lamps()})
+    lamps = [shape for shape in built.shapes() if shape.is_emitter()]
+    wanted = np.sum([sum_over_lamp(built, shape) for shape in lamps], axis=0)
+    found, error = estimates(built, eye_paths(built), 2**17)
+    assert (error < 0.02 * wanted.max()).all()
+    np.testing.assert_array_less(np.abs(found - wanted), 4 * error + 1e-3 * wanted.max())
+    _, of_path = estimates(built, mi.load_dict({"type": "path", "max_depth": 2}), 2**17)
+    assert error.sum() < 0.5 * of_path.sum()
+
+
 @pytest.mark.slow
 def test_each_of_several_gratings_draws_its_own_candidates(llvm):
     """Three plates with a BSDF each and two with the same, of which each stands at the origin once."""

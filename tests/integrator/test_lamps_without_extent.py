@@ -165,6 +165,20 @@ def with_lamp_and_sky():
     return {**with_sky(), "sky": {"type": "constant", "radiance": uniform(0.02)}, "lamp": lamp, **LAMPS["bulb"]()}
 
 
+def test_instances_have_wavelengths_of_their_own(llvm):
+    plate = {"type": "rectangle", "to_world": mi.ScalarTransform4f().translate([3, 0, 0]), "bsdf": blaze()}
+    to_world = mi.ScalarTransform4f().translate([-3, 0, 0])
+    instance = {"type": "instance", "to_world": to_world, "group": {"type": "ref", "id": "group"}}
+    group = {"type": "shapegroup", "plate": plate}
+    built = mi.load_dict(
+        {"type": "scene", "sensor": camera(), "group": group, "instance": instance, **with_lamp_and_sky()}
+    )
+    (wanted, its_error), (found, error) = by_path(built), by_lamps(built)
+    assert (error < 0.03 * wanted.max()).all()
+    assert error.sum() < its_error.sum()  # of four times the rays
+    np.testing.assert_array_less(np.abs(found - wanted), 4 * np.hypot(error, its_error))
+
+
 @pytest.mark.few(1)
 @pytest.mark.parametrize("surface", ["wide", "blend"])
 @pytest.mark.parametrize("lights", [with_sky, with_lamp_and_sky])
