@@ -575,7 +575,7 @@ def test_the_command_takes_the_same_values_of_a_scan(tmp_path, command, monkeypa
     for arguments, words in (
         ("scan.npy,channel=Height", "channel: got 'Height' for .npy"),
         ("scan.xyz,unit=V", "unit: got the unit 'V'"),
-        ("scan.npy,prepare=rotate=left", "prepare: rotate: got 'left', wanted a number"),
+        ("scan.npy,prepare=rotate=left", "prepare: got rotate=left, wanted rotate=…, a number of degrees"),
         ("blazed,unit=nm,prepare=despike", "blazed: got unit, prepare, wanted some of "),
     ):
         code, out, err = command(f"precompute {arguments} --overwrite")

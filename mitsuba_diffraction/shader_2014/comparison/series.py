@@ -189,12 +189,14 @@ def _traced(scene: mi.Scene, samples: int) -> tuple[Picture, float]:
     columns, rows = scene.sensors()[0].film().crop_size()
     sums, passes = Accumulation.empty(rows, columns), split(scene, samples, 2)
     spectrum_to_XYZ(sums.radiance(), channel_wavelengths())  # loads the observer
+    # By `path`: the wavelengths that `diffraction_path` keeps depend on their values, and differ between pictures.
+    integrator = getattr(scene.integrator(), "path", scene.integrator())
     begin = clock()
     # It has as many samples as the others, since kernels depend on their number.
-    trace_pass(scene, passes[0], 0)
+    trace_pass(scene, passes[0], 0, integrator)
     compiled = clock()
     for index, some in enumerate(passes):
-        sums.add(trace_pass(scene, some, pass_seed(0, index)), some)
+        sums.add(trace_pass(scene, some, pass_seed(0, index), integrator), some)
     seconds = clock() - compiled
     image = SpectralImage(channel_wavelengths(), sums.radiance())
     return Picture(image, sums.samples, seconds), max(0.0, compiled - begin - seconds / len(passes))
