@@ -143,19 +143,25 @@ class AliasTable:
         order = np.argsort(p > 1, axis=1, kind="stable")
         low, high = np.zeros(len(p), np.int64), (p <= 1).sum(axis=1)
         lows, last = high.copy(), self.count - 1
-        rest = p[of_each, order[of_each, np.minimum(high, last)]]
+
+        def at(position: NDArray[np.int64]) -> NDArray[np.int64]:
+            return np.asarray(order[of_each, np.minimum(position, last)])
+
+        rest = p[of_each, at(high)]  # what is left of the one that fills up others
         threshold, alias = np.ones_like(p), np.tile(np.arange(self.count), (len(p), 1))
         for _ in range(self.count):
             fills = (rest > 1) & (low < lows)
             ends = ~fills & (high < last)
-            at = of_each[fills], order[of_each, np.minimum(low, last)][fills]
-            threshold[at], alias[at] = p[at], order[of_each, np.minimum(high, last)][fills]
-            rest[fills] += p[at] - 1
-            low += fills
-            at = of_each[ends], order[of_each, high.clip(max=last)][ends]
-            following = order[of_each, (high + 1).clip(max=last)][ends]
-            threshold[at], alias[at] = rest[ends], following
+            full, used, following = (
+                (of_each[fills], at(low)[fills]),
+                (of_each[ends], at(high)[ends]),
+                at(high + 1)[ends],
+            )
+            threshold[full], alias[full] = p[full], at(high)[fills]
+            threshold[used], alias[used] = rest[ends], following
+            rest[fills] += p[full] - 1
             rest[ends] += p[of_each[ends], following] - 1
+            low += fills
             high += ends
         self._table = PacketTable(np.stack([threshold.clip(0, 1), alias], axis=-1), width=2)
 
