@@ -65,9 +65,10 @@ class Candidates:
             instanced: of groups, whose instances are in the scene.
         """
         self.light = UnshadowedLight(scene)
-        u = mi.Point2f(_random(_DIRECTIONS).x, _random(_DIRECTIONS).y)
-        slots = {shape: self._slots(scene, shape, shape.sample_position(0.0, u).p) for shape in shapes}
-        slots |= {shape: self._slots(scene, shape, _points_of_instances(scene)) for shape in instanced}
+        u = _random(0)
+        points = {shape: shape.sample_position(0.0, mi.Point2f(u.x, u.y)).p for shape in shapes}
+        points |= dict.fromkeys(instanced, _points_of_instances(scene, u) if instanced else None)
+        slots = {shape: self._slots(scene, shape, on_shape) for shape, on_shape in points.items()}
         shapes = [shape for shape in slots if slots[shape]]
         self.any = bool(shapes)
         self._bsdfs: list[mi.BSDF] = []
@@ -87,16 +88,12 @@ class Candidates:
         """Return J of a shape with these points, zero where lights are about as bright in all directions."""
         if not self.light.has_extent:
             return 0
-        rng = mi.PCG32(size=_DIRECTIONS, initseq=1)
-
-        def number() -> mi.Float:
-            return mi.Float(rng.next_float32())
-
+        u, v = (mi.Point2f(numbers.x, numbers.y) for numbers in map(_random, (1, 2)))
         si = dr.zeros(mi.SurfaceInteraction3f, _DIRECTIONS)
         si.p = points
-        drawn, _ = scene.sample_emitter_direction(si, mi.Point2f(number(), number()), False)
+        drawn, _ = scene.sample_emitter_direction(si, u, False)
         has_extent = (drawn.pdf > 0) & ~drawn.delta
-        anywhere = mi.warp.square_to_uniform_sphere(mi.Point2f(number(), number()))
+        anywhere = mi.warp.square_to_uniform_sphere(v)
         of_lights = dr.sum(dr.select(has_extent, self.light(si.p, drawn.d, True), 0)) / dr.maximum(
             dr.count(has_extent), 1
         )
@@ -195,14 +192,14 @@ class Candidates:
         return omega, dr.select(guess > 0, guess / sum_of_guesses, 0)
 
 
-def _random(count: int) -> mi.Point3f:
-    """Return points in the unit cube, always the same."""
-    rng = mi.PCG32(size=count)
+def _random(sequence: int) -> mi.Point3f:
+    """Return `_DIRECTIONS` points in the unit cube, always the same for a sequence."""
+    rng = mi.PCG32(size=_DIRECTIONS, initseq=sequence)
     return mi.Point3f(*(mi.Float(rng.next_float32()) for _ in range(3)))
 
 
-def _points_of_instances(scene: mi.Scene) -> mi.Point3f:
-    """Return points in the boxes around all instances, as Mitsuba does not draw points on them."""
+def _points_of_instances(scene: mi.Scene, u: mi.Point3f) -> mi.Point3f:
+    """Map points of the unit cube to the boxes around all instances, as Mitsuba does not draw points on them."""
     boxes = [shape.bbox() for shape in scene.shapes() if shape.class_name() == "Instance"]
     low, high = (
         mi.Point3f(np.array(corners, np.float32).T)
@@ -210,7 +207,7 @@ def _points_of_instances(scene: mi.Scene) -> mi.Point3f:
     )
     which = dr.arange(mi.UInt32, _DIRECTIONS) % len(boxes)
     low, high = (dr.gather(mi.Point3f, corner, which) for corner in (low, high))
-    return low + (high - low) * _random(_DIRECTIONS)
+    return low + (high - low) * u
 
 
 def _marks_failure(bsdf: mi.BSDF) -> bool:

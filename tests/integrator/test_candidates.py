@@ -56,19 +56,19 @@ def eye_paths(built, depth=2):
     return eye
 
 
-def samples(built, integrator, count, seed=0, wavelengths=WAVELENGTHS):
+def samples(built, integrator, count, seed=0, wavelengths=WAVELENGTHS, origin=EYE):
     """The radiance of one ray to the middle of the plate, at fixed wavelengths, (4, count)."""
     sampler = mi.load_dict({"type": "independent"})
     sampler.seed(seed, count)
-    ray = mi.Ray3f(mi.Point3f(EYE), -dr.normalize(mi.Vector3f(EYE)))
+    ray = mi.Ray3f(mi.Point3f(origin), -dr.normalize(mi.Vector3f(origin)))
     ray.wavelengths = mi.Spectrum(wavelengths)
     ray.o = ray.o + dr.zeros(mi.Float, count)
     return np.array(integrator.sample(built, sampler, mi.RayDifferential3f(ray))[0], np.float64)
 
 
-def estimates(built, integrator, count):
+def estimates(built, integrator, count, origin=EYE):
     """Mean and standard error of `samples`, (4,)."""
-    found = samples(built, integrator, count)
+    found = samples(built, integrator, count, origin=origin)
     return found.mean(axis=1), found.std(axis=1, ddof=1) / np.sqrt(count)
 
 
@@ -188,16 +188,33 @@ SURFACES = {
 }
 
 
+def assert_sum_over_lamps(built, count=2**17, limit=0.02, depth=2):
+    """Return the standard error, (4,)."""
+    lamps = [shape for shape in built.shapes() if shape.is_emitter()]
+    wanted = np.sum([sum_over_lamp(built, shape) for shape in lamps], axis=0)
+    found, error = estimates(built, eye_paths(built, depth), count)
+    assert (error < limit * wanted.max()).all()
+    np.testing.assert_array_less(np.abs(found - wanted), 4 * error + 1e-3 * wanted.max())
+    return error
+
+
 @pytest.mark.few(2)
 @pytest.mark.parametrize("name", SURFACES)
 def test_light_of_lamps_is_the_sum_over_their_points(name, llvm):
-    side = -1 if name == "sheet" else 1
-    built = scene(SURFACES[name](), **two_lamps(side))
-    lamps = [shape for shape in built.shapes() if shape.is_emitter()]
-    wanted = np.sum([sum_over_lamp(built, shape) for shape in lamps], axis=0)
-    found, error = estimates(built, eye_paths(built), 2**17)
-    assert (error < 0.02 * wanted.max()).all()
-    np.testing.assert_array_less(np.abs(found - wanted), 4 * error + 1e-3 * wanted.max())
+    assert_sum_over_lamps(scene(SURFACES[name](), **two_lamps(-1 if name == "sheet" else 1)))
+
+
+def test_later_vertices_have_the_limit_of_path(llvm):
+    """A lamp below the plate, seen by a second one above: light samples count as much as candidates."""
+    bsdf = surface(coherence_length=1.0)
+    above = {"type": "rectangle", "to_world": at(0, 0, 1.2).rotate([1, 0, 0], 180).scale(1.5), "bsdf": bsdf}
+    built = scene(bsdf, above=above, lamp=lamp("sphere", (2.3, 0.5, -0.6), 0.4, uniform(50.0)))
+    ray, path = {"origin": np.array([1.6, -1.9, 0.9])}, mi.load_dict({"type": "path", "max_depth": 4})
+    assert not samples(built, mi.load_dict({"type": "path", "max_depth": 2}), 2**14, **ray).any()
+    wanted, its_error = estimates(built, path, 2**21, **ray)
+    found, error = estimates(built, eye_paths(built, 4), 2**21, **ray)
+    assert (np.hypot(error, its_error) < 0.03 * wanted).all()
+    np.testing.assert_array_less(np.abs(found - wanted), 4 * np.hypot(error, its_error))
 
 
 def test_instances_draw_candidates(llvm):
@@ -210,11 +227,8 @@ def test_instances_draw_candidates(llvm):
         to_world = at(-3, 2.5 * k, 0)
         parts[f"{name} moved"] = {"type": "instance", "to_world": to_world, "group": {"type": "ref", "id": name}}
     built = mi.load_dict({"type": "scene", **parts, **two_lamps()})
-    lamps = [shape for shape in built.shapes() if shape.is_emitter()]
-    wanted = np.sum([sum_over_lamp(built, shape) for shape in lamps], axis=0)
-    found, error = estimates(built, eye_paths(built), 2**17)
-    assert (error < 0.02 * wanted.max()).all()
-    np.testing.assert_array_less(np.abs(found - wanted), 4 * error + 1e-3 * wanted.max())
+    # Paths that go on do not count the lamps again.
+    error, _ = assert_sum_over_lamps(built), assert_sum_over_lamps(built, depth=4)
     _, of_path = estimates(built, mi.load_dict({"type": "path", "max_depth": 2}), 2**17)
     assert error.sum() < 0.5 * of_path.sum()
 
@@ -229,11 +243,7 @@ def test_each_of_several_gratings_draws_its_own_candidates(llvm):
             for k, bsdf in enumerate(bsdfs)
         }
         built = mi.load_dict({"type": "scene", **plates, **two_lamps()})
-        lamps = [shape for shape in built.shapes() if shape.is_emitter()]
-        wanted = np.sum([sum_over_lamp(built, shape) for shape in lamps], axis=0)
-        found, error = estimates(built, eye_paths(built), 2**16)
-        assert (error < 0.03 * wanted.max()).all()
-        np.testing.assert_array_less(np.abs(found - wanted), 4 * error + 1e-3 * wanted.max())
+        assert_sum_over_lamps(built, 2**16, 0.03)
 
 
 def obstacle():

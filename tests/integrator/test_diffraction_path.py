@@ -135,16 +135,22 @@ def lamp_that_is_a_grating():
     return scene(ball=ball, spot=spot)
 
 
-def group_of_gratings(**parts):
+def group_of_gratings(sun=SUN, sky=SKY, **parts):
     """An instance of a grating and a white ball."""
     ball = {"type": "sphere", "center": [0, 0, 0.6], "radius": 0.3, "bsdf": diffuse(0.5)}
     group = {"type": "shapegroup", "grating": plate(blaze(material="Al"), 0.5), "ball": ball}
     instance = {"type": "instance", "to_world": at(1, 0, 0.2), "group": {"type": "ref", "id": "group"}}
-    return scene(group=group, instance=instance, sun=SUN, sky=SKY, **parts)
+    return scene(group=group, instance=instance, sun=sun, sky=sky, **parts)
 
 
-def instance_beside_a_grating():
-    return group_of_gratings(plate=plate(blaze(material="Al"), 0.5, 0.4))
+def instance_beside_a_grating(**lights):
+    return group_of_gratings(plate=plate(blaze(material="Al"), 0.5, 0.4), **lights)
+
+
+def ball_of_light():
+    """A lamp for which candidates are drawn."""
+    emitter = {"type": "area", "radiance": uniform(0.5)}
+    return {"type": "sphere", "center": [0.4, -0.8, 3.4], "radius": 1.0, "emitter": emitter}
 
 
 def curve_beside_a_grating(tmp_path):
@@ -222,10 +228,28 @@ def assert_agree(built, depth, spp, **parameters):
         pytest.param(blend_under_a_point, -1, 1024, marks=pytest.mark.slow),
         pytest.param(lamp_that_is_a_grating, 3, 512, marks=pytest.mark.slow),
         pytest.param(instance_beside_a_grating, 4, 1024, marks=pytest.mark.slow),
+        pytest.param(
+            lambda: instance_beside_a_grating(sun=ball_of_light()),
+            5,
+            2048,
+            marks=pytest.mark.slow,
+            id="lamp and instance",
+        ),
     ],
 )
 def test_converges_to_the_limit_of_path(build, depth, spp, llvm):
     assert_agree(build(), depth, spp, rr_depth=3)
+
+
+@pytest.mark.slow
+def test_instances_alone_have_the_limit_of_path(llvm):
+    """No light is traced from gratings, but direct light on them is drawn by candidates."""
+    built = group_of_gratings(sun=ball_of_light(), sky={**SKY, "radiance": uniform(0.005)})
+    integrators = [mi.load_dict({"type": name, "max_depth": 4}) for name in ("path", "diffraction_path")]
+    eye, light = integrators[1].parts(built, built.sensors()[0])
+    assert (eye.candidates.any, light) == (True, None)
+    (wanted, its_error), (found, error) = (region_means(built, each, 1024) for each in integrators)
+    np.testing.assert_array_less(np.abs(found - wanted), 4 * np.hypot(its_error, error))
 
 
 @pytest.mark.slow

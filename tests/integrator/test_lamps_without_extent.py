@@ -14,6 +14,7 @@ import mitsuba_diffraction  # noqa: F401 (settles which LLVM is used before a va
 from mitsuba_diffraction.evaluation.benchmark import noise
 from mitsuba_diffraction.integrator.lamps_without_extent import Emitters, resampled
 from mitsuba_diffraction.render.scene_file import SceneFile
+from mitsuba_diffraction.render.trace_pass import trace_pass
 
 EYE = np.array([0.6, -0.9, 2.0])
 EDGES = np.linspace(360, 830, 11)  # of ten bins, nm
@@ -259,6 +260,21 @@ def test_pictures_have_the_means_of_path(film, sensor, llvm):
         errors.append(np.std(pictures, axis=0, ddof=1) / np.sqrt(8))
     assert means[0].shape == means[1].shape == (2, 3, 4 if film == "colours" else 2)
     # A standard error of eight pictures is itself known to a quarter.
+    np.testing.assert_array_less(np.abs(means[1] - means[0]), 6 * np.hypot(*errors) + 1e-6)
+
+
+def test_sums_of_pixels_contain_the_light_of_lamps(llvm):
+    """As `render` takes them, under a filter wider than a pixel."""
+    built = scene(blend(), with_sky(), fov=8.0, **FILMS["bands"], rfilter={"type": "gaussian"})
+    means, errors = [], []
+    for name, spp in (("path", 1024), ("diffraction_path", 256)):
+        integrator = mi.load_dict({"type": name, "max_depth": 2})
+        sums = [trace_pass(built, spp, seed, integrator).sum((0, 1)) for seed in range(8)]
+        radiance = [of_picture[:-1] / of_picture[-1] for of_picture in np.array(sums, np.float64)]
+        of_bins = [of_picture[:90].reshape(10, 9).sum(1) for of_picture in radiance]
+        means.append(np.mean(of_bins, axis=0))
+        errors.append(np.std(of_bins, axis=0, ddof=1) / np.sqrt(8))
+    assert (errors[1] < 0.05 * means[0].max()).all()
     np.testing.assert_array_less(np.abs(means[1] - means[0]), 6 * np.hypot(*errors) + 1e-6)
 
 
