@@ -30,7 +30,7 @@ from .arguments import (
     recipe_of,
 )
 
-_OF_LIGHT = ("theory", "transmission", "material", "int_ior")  # besides the surface
+_OF_LIGHT = ("theory", "transmission", "material", "int_ior", "ext_ior")  # besides the surface
 
 
 @named_as_options({"wavelengths": "--wavelength"})
@@ -59,8 +59,6 @@ def efficiency(
     angles, wavelengths = angles_of("--angle", angle), parse_numbers("--wavelength", wavelength)
     name, values = parsed(surface)
     given = {key: values.pop(key) for key in _OF_LIGHT if key in values}
-    if "ext_ior" in values:
-        raise RequestError(f"ext_ior: got {values['ext_ior']} of the recipe, wanted none: these orders are in air")
     # The names of rigorous theory are known to its recipes alone.
     of_theory = {"theory": "rigorous"} if given.get("theory") == "rigorous" else {}
     recipe = recipe_of(name, values | of_theory)

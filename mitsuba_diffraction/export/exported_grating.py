@@ -154,10 +154,11 @@ def material_of(chosen: Mapping[str, Any], parameters: Mapping[str, Any]) -> tup
     """Return (material, int_ior), one of them None, from parameters or else those chosen in a recipe; n = 1.5 of none.
 
     Raises:
-        ValueError: if both are given, or the recipe is of a grating below another medium than air.
+        ValueError: if both are given, or the grating lies below another medium than air.
     """
-    if "ext_ior" in chosen:
-        raise RequestError(f"ext_ior: got {chosen['ext_ior']:g} of the recipe, wanted none: these orders are in air")
+    outside = {**chosen, **parameters}.get("ext_ior", 1)
+    if outside != 1:
+        raise RequestError(f"ext_ior: got {outside} of the recipe, wanted none: these orders are in air")
     tables: list[Mapping[str, Any]] = [parameters, chosen, {"int_ior": 1.5}]
     given = next(table for table in tables if {"material", "int_ior"} & table.keys())
     material, int_ior = given.get("material"), given.get("int_ior")
