@@ -80,8 +80,11 @@ class SceneFile:
         return other
 
     @cached_property
-    def _content(self) -> tuple[bytes, mi.parser.ParserState]:
-        """The bytes of the file, and what the parser makes of them, with gratings in the place of BSDFs."""
+    def _content(self) -> tuple[bytes, mi.parser.ParserState, mi.FileResolver]:
+        """The bytes of the file, what the parser makes of them, with gratings in the place of BSDFs, and its folders.
+
+        These are the folder of the file and those of its `<path value="…"/>`, which the parser adds.
+        """
         path = Path(self.path)
         refuse_other_than_utf8(os.path.realpath(path))
         if path.is_dir():
@@ -93,40 +96,40 @@ class SceneFile:
             is_example = (examples_folder() / "scenes" / path.name).is_file()
             hint = "; mitsuba-diffraction examples writes it" if is_example else ""
             raise FileNotFoundError(f"{path}: no such file{hint}")
-        with self._beside():
+        folders = mi.FileResolver(mi.file_resolver())
+        folders.prepend(str(path.resolve().parent))
+        with self._searching(folders):
             config = _config()
             state = mi.parser.parse_file(config, str(path.resolve()), **self.parameters)
             if self.materials:
                 mi.parser.transform_resolve(config, state)
                 replace_materials(state, self.materials)
             _refuse_missing_files(path, state)
-        return path.read_bytes(), state
+        return path.read_bytes(), state, folders
 
     @contextmanager
-    def _beside(self) -> Iterator[None]:
-        """Search the folder of the scene first, and raise exceptions as ValueError with the cause in one line."""
-        resolver = mi.file_resolver()
-        beside_scene = mi.FileResolver(resolver)
-        beside_scene.prepend(str(Path(self.path).resolve().parent))
-        mi.set_file_resolver(beside_scene)
+    def _searching(self, folders: mi.FileResolver) -> Iterator[None]:
+        """Search these folders for files, and raise exceptions as ValueError with the cause in one line."""
+        before = mi.file_resolver()
+        mi.set_file_resolver(folders)
         try:
             yield
         except Exception as error:
             alternatives = _alternatives(Path(self.path), str(error), self.parameters)
             raise RequestError(f"{self.path}: {root_cause(error)}{alternatives}") from error
         finally:
-            mi.set_file_resolver(resolver)
+            mi.set_file_resolver(before)
 
     @contextmanager
     def parsed(self) -> Iterator[tuple[mi.parser.ParserConfig, mi.parser.ParserState]]:
-        """Yield a copy of the parsed scene; in the block, Mitsuba searches the folder of the scene first.
+        """Yield a copy of the parsed scene; in the block, Mitsuba searches the folders of the scene first.
 
         Raises:
             FileNotFoundError: if there is no such file.
             ValueError: if it is a folder, or parsing or the block fails, with the cause in one line.
         """
-        _, state = self._content
-        with self._beside():
+        _, state, folders = self._content
+        with self._searching(folders):
             yield _config(), mi.parser.ParserState(state)
 
     def files(self) -> list[Path]:

@@ -1,6 +1,7 @@
 import gc
 import math
 import os
+import pickle
 from itertools import combinations
 from pathlib import Path
 
@@ -495,9 +496,36 @@ def test_files_are_looked_up_beside_the_scene(llvm, tmp_path, monkeypatch):
     assert str(mi.file_resolver()) == before
 
 
+def test_a_scene_searches_the_folders_that_it_names(llvm, tmp_path):
+    # Regression: `<path>` was forgotten after parsing; mi.load_file loaded such scenes, and no command.
+    folder = tmp_path / "scenes"
+    (folder / "common" / "maps").mkdir(parents=True)
+    Image.new("L", (2, 2), 128).save(folder / "common" / "maps" / "grey.png")
+    texture = '<texture type="bitmap" name="reflectance"><string name="filename" value="maps/grey.png"/></texture>'
+    included = f'<scene version="3.0.0"><bsdf id="painted" type="diffuse">{texture}</bsdf></scene>'
+    (folder / "common" / "paint.xml").write_text(included)
+    shape = '<shape type="sphere"><ref id="painted"/></shape>'
+    path = write_scene(folder, f'<path value="$folder"/><include filename="paint.xml"/>{shape}{CONSTANT}')
+    scene_file = SceneFile(path, {"folder": "common"})
+    for loaded in (
+        scene_file.load(),
+        pickle.loads(pickle.dumps(scene_file)).load(),
+        mi.load_file(str(path), folder="common"),
+    ):
+        assert loaded.shapes()[0].bsdf().id() == "painted"
+    assert {file.name for file in scene_file.files()} == {"scene.xml", "paint.xml", "grey.png"}
+    before = scene_file.digest()
+    Image.new("L", (2, 2), 129).save(folder / "common" / "maps" / "grey.png")
+    assert scene_file.moved(None).digest() != before
+    grating = {"profile": "blazed", "period": 2.5, "depth": 0.25, "orientation": "maps/grey.png"}
+    (shape,) = SceneFile(path, {"folder": "common"}, {"painted": grating}).load().shapes()
+    assert mi.traverse(shape.bsdf())["orientation.data"].shape == (2, 2, 1)
+
+
 @pytest.mark.parametrize(
     ("content", "message"),
     [
+        ('<path value="nonesuch"/>', 'folder ".*nonesuch" not found'),
         ('<shape type="nonesuch"/>', "nonesuch"),
         ('<shape type="sphere"><float name="radiu" value="1"/></shape>', "radiu"),
         ('<shape type="sphere">', "failed"),
