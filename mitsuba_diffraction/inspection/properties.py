@@ -14,7 +14,7 @@ from ..precomputation.spectra import precompute
 from ..progress import Progress, part, silent
 from ..scalar_theory.validity import ScalarError, scalar_error
 from ..settings import SUN_COHERENCE_LENGTH, VISIBLE, ScalarSettings, lobe_width
-from ..spectrum.sample import effective_coherence_length, standard_error
+from ..spectrum.sample import MIN_PIXELS, effective_coherence_length, standard_error
 from ..surface.heightfield import HeightField
 from ..surface.periods import Period, find_periods, hann
 from ..surface.prepare import white_noise
@@ -23,6 +23,7 @@ from .predicted_colours import CHANGE, MAX_COLOUR_COHERENCE_LENGTH, Change, chan
 _TOLERANCE = 0.02
 _MAX_PIECE_SIZE = 20.0  # µm, side of the part of a large scan from which colours are predicted
 _MIN_PIECE_PIXEL = 0.04  # µm, to which smaller pixels of that part are averaged; light requires 0.09 µm
+_MIN_PIECE_COUNT = 16  # pixels along each side of that part, where they are coarse: twice what a window requires
 
 
 @dataclass(frozen=True)
@@ -114,7 +115,8 @@ def inspect(
     piece = _middle(height_field) if extent == "sample" else height_field
     colours_length = min(used, MAX_COLOUR_COHERENCE_LENGTH)
     if extent == "sample":
-        colours_length = effective_coherence_length(piece, colours_length)
+        coarse = MIN_PIXELS * max(height_field.pixel_size)
+        colours_length = effective_coherence_length(piece, max(colours_length, min(used, coarse)))
     # The two changes of the tip need spectra of their own.
     spectra = iter([(0.15, 0.4), (0.4, 0.7), (0.7, 1.0)] if measured else [(0.15, 1.0)])
 
@@ -166,8 +168,14 @@ def inspect(
 
 
 def _middle(scan: HeightField) -> HeightField:
-    """Return the middle of a scan, at most `_MAX_PIECE_SIZE` wide, its pixels averaged to about `_MIN_PIECE_PIXEL`."""
-    counts = [min(n, round(_MAX_PIECE_SIZE / size)) for n, size in zip(scan.shape, scan.pixel_size[::-1], strict=True)]
+    """Return the middle of a scan, its pixels averaged to about `_MIN_PIECE_PIXEL`.
+
+    It is at most `_MAX_PIECE_SIZE` or `_MIN_PIECE_COUNT` pixels wide.
+    """
+    counts = [
+        min(n, max(_MIN_PIECE_COUNT, round(_MAX_PIECE_SIZE / size)))
+        for n, size in zip(scan.shape, scan.pixel_size[::-1], strict=True)
+    ]
     if 1 in scan.shape or (
         tuple(counts) == scan.shape and scan.heights.size <= (_MAX_PIECE_SIZE / _MIN_PIECE_PIXEL) ** 2
     ):

@@ -28,7 +28,7 @@ _SUPPORT = 6.0
 # Largest coherence length relative to the scan: the window is then three quarters of the scan, with three positions σ_s
 # apart along each axis.
 _MAX_COHERENCE_FRACTION = 0.5
-_MIN_PIXELS = 4
+MIN_PIXELS = 4  # in a coherence length
 MAX_BATCH_SIZE = 1 << 17  # numbers that are transformed at once
 
 
@@ -54,10 +54,11 @@ def effective_coherence_length(height_field: HeightField, requested: float) -> f
     axes = list(zip(height_field.tile_size, height_field.pixel_size, height_field.shape[::-1], strict=True))
     effective = min([float(requested), *(_MAX_COHERENCE_FRACTION * size for size, _, count in axes if count > 1)])
     for _, pixel, count in axes:
-        if count > 1 and effective < _MIN_PIXELS * pixel * (1 - 1e-9):
+        if count > 1 and effective < MIN_PIXELS * pixel * (1 - 1e-9):
+            limit = f", of which the scan of {axes[0][0]:.4g} × {axes[1][0]:.4g} µm supports {effective:.4g}"
             raise RequestError(
-                f"coherence_length: got {requested:g} µm, of which the scan of {axes[0][0]:.4g} × {axes[1][0]:.4g} µm "
-                f"supports {effective:.4g}; wanted at least {_MIN_PIXELS} pixels of {pixel:.4g} µm"
+                f"coherence_length: got {requested:g} µm{limit if effective < requested else ''}; wanted at least "
+                f"{MIN_PIXELS} pixels of {pixel:.4g} µm"
             )
     return effective
 
@@ -96,7 +97,7 @@ def mean_periodogram(
 
 
 def _axis(count: int, pixel: float, sigma: float) -> WindowAxis:
-    width = min(count, max(_MIN_PIXELS, _rounded_up(_SUPPORT * sigma / pixel)))
+    width = min(count, max(MIN_PIXELS, _rounded_up(_SUPPORT * sigma / pixel)))
     x = (np.arange(width) - (width - 1) / 2) * pixel
     window = np.exp(-(x**2) / (2 * sigma**2))
     positions = np.rint(np.linspace(0, count - width, _rounded_up((count - width) * pixel / sigma) + 1))

@@ -565,6 +565,21 @@ def test_colours_of_a_large_scan_are_those_of_its_middle_and_progress_moves():
     assert shown[-1] == 1
 
 
+@pytest.mark.parametrize("pixel", [8.0, 0.001, 5.0, 16.2, 1e-4, 0.02, 0.4, 1.3])
+def test_pixels_of_any_size_are_inspected(pixel):
+    x = np.arange(32)
+    field = md.HeightField(0.2 * np.sin(2 * np.pi * x / 4.3) + np.zeros((32, 1)), pixel)
+    seen = inspect(field, measured=False)
+    assert seen.periods[0].period == pytest.approx(4.3 * pixel, rel=0.01)
+    assert 4 * seen.piece.pixel_size[0] <= seen.spectrum.coherence_length <= seen.piece.tile_size[0] / 2 * (1 + 1e-9)
+    assert seen.piece.tile_size[0] >= min(20, 32 * pixel) * (1 - 1e-9)
+
+
+def test_pixels_too_coarse_for_the_coherence_length_are_named():
+    with pytest.raises(ValueError, match=r"got 65 µm; wanted at least 4 pixels of 50 µm"):
+        inspect(md.HeightField(np.eye(64), 50.0))
+
+
 def test_fine_pixels_of_a_scan_are_averaged_for_its_colours():
     x = 0.01 * (np.arange(600) + 0.5)
     field = md.HeightField(0.05 * np.sin(2 * np.pi * x / 1.5) + np.zeros((600, 1)), 0.01)
