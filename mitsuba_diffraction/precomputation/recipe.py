@@ -318,7 +318,10 @@ class Recipe:
         """Return the SHA-256 of everything that determines the spectrum: the recipe and the contents of the scan."""
         versions = [SCALAR_FORMAT_VERSION, _BUILD_VERSION, *build_versions(self.settings)]
         content = hashlib.sha256(".".join(map(str, versions)).encode())
-        surface = {name: value for name, value in self.surface.items() if name != "scan"}
+        surface = {name: value for name, value in self.surface.items() if name not in ("scan", "patches")}
+        if "profile" in surface:
+            parameters = inspect.signature(PROFILES[surface["profile"]]).parameters.items()
+            surface = {name: p.default for name, p in parameters if p.default is not p.empty} | surface
         for scan in self.files:
             refuse_special(scan)
             content.update(scan.read_bytes())
@@ -326,6 +329,8 @@ class Recipe:
         settings = self.settings.chosen
         if is_file(material := settings.get("material")):
             settings["material"] = Path(str(material)).name
+        # By values: 1200 and 1200.0 are one number.
+        surface, settings = json.loads(json.dumps((surface, settings), default=str), parse_int=float)
         request = surface, self.patches, settings
         content.update(json.dumps(request, sort_keys=True, default=str).encode())
         return content.hexdigest()

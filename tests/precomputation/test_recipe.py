@@ -11,6 +11,7 @@ import pytest
 import mitsuba_diffraction as md
 from mitsuba_diffraction import GratingSpectrum, Recipe
 from mitsuba_diffraction.precomputation import recipe as recipe_module
+from mitsuba_diffraction.precomputation import surface_text
 from mitsuba_diffraction.precomputation.spectra import build_spectrum
 from mitsuba_diffraction.settings import RigorousSettings, ScalarSettings, Settings
 from mitsuba_diffraction.surface.readers import read_height_field
@@ -466,6 +467,24 @@ def test_digest_does_not_depend_on_the_order_of_entries():
 def test_digest_does_not_depend_on_stated_defaults():
     stated = Settings.of(extent="tile", wavelengths=(360, 830), theory="scalar", **FAST)
     assert Recipe(CROSSED, stated).digest() == Recipe(CROSSED, ScalarSettings(**FAST)).digest()
+
+
+@pytest.mark.parametrize(
+    ("one", "same"),
+    [
+        ("ruled,lines_per_mm=1200", "ruled,lines_per_mm=1200.0"),
+        ("blazed,period=2,depth=0.25,coherence_length=30", "blazed,depth=.25,coherence_length=3e1,period=2.00"),
+        (
+            "sinusoidal,period=1,depth=0.2,theory=rigorous,int_ior=2",
+            "sinusoidal,period=1,depth=0.2,theory=rigorous,int_ior=2.0",
+        ),
+        ("elaphe_synthetic,extent=tile", "elaphe_synthetic,extent=tile,seed=0,patches=16"),
+    ],
+)
+def test_digest_does_not_depend_on_how_a_number_is_written(one, same):
+    first, second = (Recipe.of_source(*surface_text.parsed(text)) for text in (one, same))
+    assert first.patches == second.patches
+    assert first.digest() == second.digest()
 
 
 def test_the_cache_is_the_users_unless_named(monkeypatch, tmp_path):
