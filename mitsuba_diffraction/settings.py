@@ -9,7 +9,7 @@ from collections.abc import Callable
 from dataclasses import dataclass, fields
 from pathlib import Path
 from statistics import NormalDist
-from typing import Any, ClassVar, cast
+from typing import Any, ClassVar
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -200,7 +200,7 @@ class RigorousSettings(Settings):
     """The parameters of a table of rigorous theory, of a tile and for all directions, beside those of `Settings`.
 
     Attributes:
-        int_ior: index of a dielectric, or n + ik; a name or a file is kept as material.
+        int_ior: index of a dielectric, or n + ik; or a medium with dispersion, or a file.
         material: or a conductor by Mitsuba's name, a medium with dispersion, or a file (`materials.index_of`).
         ext_ior: index of the medium above relative to air, for a grating under a coat; wavelengths are measured in this
             medium.
@@ -225,13 +225,10 @@ class RigorousSettings(Settings):
         self._check_known("transmission", TRANSMISSIONS)
         super().__post_init__()
         self._check("ext_ior", lambda x: 1 <= x <= 10, "the index of the medium above, from 1 to 10")
-        if isinstance(self.int_ior, str) and self.material is None:
-            object.__setattr__(self, "material", self.int_ior)
-            object.__setattr__(self, "int_ior", None)
         if not isinstance(self.polarised, bool):
             raise RequestError(f"polarised: got {self.polarised!r}, wanted True or False")
         if self.transmission != "none":
-            if self.int_ior is None or np.imag(cast(complex, self.int_ior)) != 0:
+            if self.int_ior is None or isinstance(self.int_ior, str) or np.imag(self.int_ior) != 0:
                 raise RequestError(
                     f"transmission: got {self.transmission} with material {self.material!r} and int_ior "
                     f"{self.int_ior!r}, wanted a dielectric of one index, a number"

@@ -11,6 +11,7 @@ import pytest
 
 import mitsuba_diffraction as md
 from mitsuba_diffraction import testing
+from mitsuba_diffraction.optics.materials import index_of
 from mitsuba_diffraction.rigorous.build_table import build_rigorous
 from mitsuba_diffraction.rigorous.rigorous_spectrum import Axes, RigorousSpectrum
 from mitsuba_diffraction.settings import RigorousSettings
@@ -53,7 +54,8 @@ def made_up(coherence_length=65.0):
             eta = 1 + np.sin(0.6 * (come + a) + 1) ** 2 + np.sin(1 - 0.6 * (leave + a)) ** 2
             values[start + row] = np.multiply.outer(eta, wavelengths)[:, None] / (80 + 5 * (come - leave))
     settings = RigorousSettings(material="Al", coherence_length=coherence_length, tolerance=0.01)
-    return RigorousSpectrum(axes, values, None, settings, 0, 0, 0, 1, "made up", "")
+    digest = index_of("material", "Al").digest
+    return RigorousSpectrum(axes, values, None, settings, 0, 0, 0, 1, "made up", "", digest)
 
 
 @functools.cache

@@ -11,6 +11,7 @@ import numpy as np
 from ..errors import RequestError
 from ..optics.film_stack import Stack
 from ..optics.materials import MAX_INDEX, MIN_INDEX, KnownRange, RefractiveIndex, constant, index_of, is_file
+from ..optics.media import DEFAULT_INT_IOR
 from .base import nested_plugin
 from .coat import Coat
 from .device_tables import opaque
@@ -96,7 +97,7 @@ def reflectance_from(props: mi.Properties, coat: Coat | None) -> Material:
     above = None if coat is None or coat.dispersion is None else coat
     if "material" not in props and not own:
         outside = coat.index if coat is not None else absolute_index("ext_ior", props.get("ext_ior", "air"))
-        return Dielectric(index_from("int_ior", props.get("int_ior", 1.5)), outside, above)
+        return Dielectric(index_from("int_ior", props.get("int_ior", DEFAULT_INT_IOR)), outside, above)
     named = own[0] if own else "material"
     if "int_ior" in props or ("ext_ior" in props and "coat_ior" not in props):
         raise RequestError(

@@ -15,9 +15,11 @@ import numpy as np
 from ..errors import RequestError, is_number
 from ..handed_over_spectra import handed_over
 from ..optics.geometry import SHADOWING
-from ..optics.materials import KnownRange, RefractiveIndex, index_of, is_file
+from ..optics.materials import KnownRange, RefractiveIndex, is_file
+from ..optics.media import DEFAULT_INT_IOR, MediumBelow
 from ..precomputation.recipe import REQUESTED, Recipe, source_named
 from ..precomputation.spectra import Spectrum, load_spectrum
+from ..rigorous.build_table import medium_below
 from ..rigorous.rigorous_spectrum import RigorousSpectrum
 from ..settings import (
     FROM_RADIUS,
@@ -99,7 +101,7 @@ class Media:
                 got = repr(props[name]) if isinstance(props[name], str | float | int) else "a BSDF"
                 raise RequestError(f"{name}: got {got} with transmission={kind}, wanted a dielectric (int_ior) alone")
         # Computed as by `Dielectric`, so that both are equal.
-        medium = index_from("int_ior", props.get("int_ior", 1.5))
+        medium = index_from("int_ior", props.get("int_ior", DEFAULT_INT_IOR))
         eta = medium.nominal.real / exterior
         if abs(eta - 1) < SAME_INDEX:
             raise RequestError(f"int_ior: got that of the outside with transmission={kind}, wanted another one")
@@ -330,7 +332,7 @@ def _material_settings(props: mi.Properties, bare: Material, coat: Coat | None) 
     if isinstance(bare, SpectralConductor):
         raise RequestError("eta: got spectra with theory=rigorous, wanted the name of a conductor or a file: material")
     if bare.dispersion is not None:
-        return {"material": _resolved(props["int_ior"])}
+        return {"int_ior": _resolved(props["int_ior"])}
     if isinstance(bare, PerfectMirror):
         raise RequestError("material: got 'none', wanted a real one for theory=rigorous, such as 'Al'")
     # Rounded to the digits of a float32.
@@ -401,13 +403,7 @@ def check_rigorous(spectrum: RigorousSpectrum, request: GratingRequest) -> None:
         )
     if stated is None:
         return
-    if is_file(material := stated.get("material", "")):
-        same = index_of("material", material).digest == spectrum.material_digest
-    elif material:
-        same = material == spectrum.settings.material
-    else:
-        same = abs(stated["int_ior"] - spectrum.int_ior) < 1e-3 * abs(spectrum.int_ior)
-    if not same:
+    if not spectrum.is_of(MediumBelow.requested(stated)):
         got = " ".join(f"{name} {value}" for name, value in stated.items())
         raise RequestError(
             f"material: got {got}, but the rigorous spectrum is of {spectrum.material_name}: "
@@ -453,9 +449,7 @@ class GratingRequest:
     def _known_of_recipe(self) -> tuple[KnownRange, ...]:
         """Where the index of a rigorous recipe is known: once, as its file may be gone when a kernel is traced."""
         settings = self.surface.settings if isinstance(self.surface, Recipe) else None
-        if isinstance(settings, RigorousSettings) and settings.material:
-            return (index_of("material", settings.material).known("material"),)
-        return ()
+        return medium_below(settings).known if isinstance(settings, RigorousSettings) else ()
 
     def widened(self, wavelengths: tuple[float, float]) -> Recipe | None:
         """Return the recipe for light of these wavelengths in air, nm; None for one that sets its own, or a file."""

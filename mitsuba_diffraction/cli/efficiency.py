@@ -4,15 +4,15 @@ from __future__ import annotations
 
 from functools import partial
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated
 
 import typer
 
 from ..errors import RequestError
-from ..export.exported_grating import material_of
+from ..export.exported_grating import medium_in_air
 from ..files.outputs import check_outputs
-from ..inspection.efficiency import OrderEfficiencies, efficiencies
-from ..inspection.peaks import check_request, peak_efficiencies
+from ..inspection.efficiency import OrderEfficiencies, order_efficiencies
+from ..inspection.peaks import check_request, efficiencies_of_peaks
 from ..precomputation.grating_spectrum import GratingSpectrum
 from ..precomputation.spectra import load_spectrum
 from ..precomputation.surface_text import parsed
@@ -65,7 +65,7 @@ def efficiency(
     settings = ScalarSettings() if recipe is None else recipe.settings
     chosen = {"theory": "scalar", "transmission": "none", **settings.chosen}
     theory, transmission = (given.get(key, chosen[key]) for key in _OF_LIGHT[:2])
-    material, int_ior = material_of(chosen, given)
+    below = medium_in_air(chosen, given)
     if csv is not None:
         check_suffix("--csv", csv, ".csv")
     if plot is not None:
@@ -77,27 +77,19 @@ def efficiency(
         raise RequestError(
             f"{name}: got theory {theory}, transmission {transmission} of an irregular surface, wanted scalar, none"
         )
-    light: dict[str, Any] = {"material": material, "int_ior": int_ior, "azimuth": azimuth}
+    light = angles, wavelengths, azimuth
     found: OrderEfficiencies
     if recipe is None or irregular:
-        check_request(settings.wavelengths, angles, wavelengths, material, int_ior)  # before a spectrum is computed
+        check_request(settings.wavelengths, angles, wavelengths, below)  # before a spectrum is computed
         cached = load_spectrum(name) if recipe is None else recipe.cached(partial(progress_bar, unit="%"))
         if not isinstance(cached, GratingSpectrum):
             raise RequestError(f"{name}: got a spectrum of rigorous theory, wanted its recipe")
         with progress_bar(f"peaks of {name}") as progress:
-            found = peak_efficiencies(cached, angles, wavelengths, **light, progress=progress)
+            found = efficiencies_of_peaks(cached, below, *light, progress)
         warning = cached.warning
     else:
         with progress_bar(f"efficiencies of {name}") as progress:
-            found = efficiencies(
-                recipe.height_field(),
-                angles,
-                wavelengths,
-                theory=theory,
-                transmission=transmission,
-                **light,
-                progress=progress,
-            )
+            found = order_efficiencies(recipe.height_field(), below, *light, theory, transmission, progress)
             warning = scalar_error(recipe.height_field()).warning if theory == "scalar" else ""
     tell(str(found))
     if warning:

@@ -10,7 +10,7 @@ import typer
 
 from ..errors import RequestError
 from ..export.cycles import shader_recipe, write_shader
-from ..export.exported_grating import ExportedGrating, material_of
+from ..export.exported_grating import ExportedGrating, medium_in_air
 from ..export.lswm import write_lswm
 from ..export.order_table import write_order_table
 from ..files.outputs import check_outputs
@@ -116,7 +116,7 @@ def _write_shader(title: str, recipe: Recipe | None, parameters: dict[str, Any],
     chosen = recipe.settings.chosen if recipe else {}
     if is_film(title) or chosen.get("transmission", "none") != "none":
         say("note", f"{title}: the shader shows the light that it reflects; `render` shows what it transmits")
-    held = write_shader(spectrum, output, *material_of(chosen, parameters))
+    held = write_shader(spectrum, output, medium_in_air(chosen, parameters))
     if spectrum.warning:
         tell(f"! {spectrum.warning}")
     tell(f"{output}: {spectrum.source}; {held}")

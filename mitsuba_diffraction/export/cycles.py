@@ -20,9 +20,9 @@ from ..array_types import Real
 from ..files.outputs import MARK
 from ..files.writing import whole_file
 from ..inspection.efficiency import description
-from ..inspection.order_solver import index_at
 from ..optics.color import SRGB_TO_XYZ, XYZ_to_linear_sRGB, daylight, matching_functions
 from ..optics.geometry import diffracted, fresnel
+from ..optics.media import MediumBelow
 from ..precomputation.grating_spectrum import GratingSpectrum
 from ..precomputation.recipe import Recipe
 from ..settings import VISIBLE, wavelengths_inside
@@ -47,26 +47,20 @@ def shader_recipe(recipe: Recipe) -> Recipe:
     return replace(recipe, settings=replace(settings, wavelengths=wavelengths_inside(1.0, _MAX_HEIGHT_SCALE)))
 
 
-def write_shader(
-    spectrum: GratingSpectrum,
-    path: str | os.PathLike[str],
-    material: str | None = None,
-    int_ior: complex | str | None = None,
-) -> str:
+def write_shader(spectrum: GratingSpectrum, path: str | os.PathLike[str], below: MediumBelow) -> str:
     """Write the shader of a spectrum of scalar theory; return what it holds.
 
     Args:
         spectrum: S(q; κ).
         path: of the file.
-        material: a conductor by Mitsuba's name or a file, or "none", the perfect mirror.
-        int_ior: or the index of a dielectric, a number, a name or a file.
+        below: the medium below it, in air.
 
     Raises:
         ValueError: if the material is wrong.
     """
-    what = description(spectrum.source, material, int_ior, 0.0)
+    what = description(spectrum.source, below, 0.0)
     edges, colours = _wavelength_bins()
-    index = np.array([index_at(w, material, int_ior) for w in (edges[1:] + edges[:-1]) / 2])
+    index = np.array([below.at(w) for w in (edges[1:] + edges[:-1]) / 2])
     index = np.where(np.isinf(index), 0, index)
     max_kappa = min(_MAX_HEIGHT_SCALE * 4e3 * np.pi / SHORTEST_DRAWN, spectrum.max_kappa)
     arrays: dict[str, tuple[str, Real]] = {

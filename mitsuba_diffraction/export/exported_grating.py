@@ -13,9 +13,9 @@ from numpy.typing import ArrayLike, NDArray
 from ..array_types import Complex, Real
 from ..errors import RequestError
 from ..inspection.efficiency import checked_numbers, description
-from ..inspection.order_solver import IncidentLight, OrderSolver, index_at, order_solver
+from ..inspection.order_solver import IncidentLight, OrderSolver, order_solver
 from ..optics.geometry import Orders
-from ..optics.materials import index_of
+from ..optics.media import MediumBelow
 from ..precomputation.recipe import Recipe
 from ..rigorous.coordinate_transformation import is_profile
 from ..settings import THEORIES
@@ -55,8 +55,7 @@ class ExportedGrating:
     Attributes:
         height_field: one period.
         theory: "scalar" or "rigorous".
-        material: a conductor by Mitsuba's name or a file; "none" is the perfect mirror, in scalar theory.
-        int_ior: or the index of a dielectric, a number, a name or a file.
+        below: the medium below it.
         shortest: µm, the shortest wavelength that is requested.
 
     Raises:
@@ -65,14 +64,14 @@ class ExportedGrating:
 
     height_field: HeightField
     theory: str
-    material: str | None
-    int_ior: complex | str | None
+    below: MediumBelow
     shortest: float
 
     def __post_init__(self) -> None:
         if self.theory not in THEORIES:
             raise RequestError(f"theory: got {self.theory!r}, wanted one of {', '.join(THEORIES)}")
-        self.index(self.shortest)
+        self.below.check_theory(self.theory)
+        self.below.at(self.shortest)
 
     @classmethod
     def of_recipe(cls, recipe: Recipe, name: str, parameters: Mapping[str, Any], shortest: float) -> ExportedGrating:
@@ -98,14 +97,14 @@ class ExportedGrating:
         return cls(
             field,
             parameters.get("theory", recipe.settings.theory),
-            *material_of(recipe.settings.chosen, parameters),
+            medium_in_air(recipe.settings.chosen, parameters),
             shortest,
         )
 
     @property
     def description(self) -> str:
         """What it is, in one line."""
-        return description(self.height_field.source, self.material, self.int_ior, 0.0, self.theory)
+        return description(self.height_field.source, self.below, 0.0, self.theory)
 
     @property
     def period(self) -> tuple[float, float]:
@@ -116,18 +115,13 @@ class ExportedGrating:
     @property
     def transmits(self) -> bool:
         """Whether light crosses the surface."""
-        return self.int_ior is not None and not index_of("int_ior", self.int_ior).absorbs
-
-    def index(self, wavelength: float) -> complex:
-        """Return n + ik at a wavelength in µm."""
-        return index_at(wavelength, self.material, self.int_ior, self.theory)
+        return self.below.transparent
 
     @cached_property
     def _solver(self) -> OrderSolver:
         shortest = self.shortest
-        if self.int_ior is not None and self.transmits:
+        if (index := self.below.index) is not None and self.transmits:
             # The maximum of |q| is 2n/λ, of light reflected inside; linear in n, n/λ has it at a node.
-            index = index_of("int_ior", self.int_ior)
             at = np.append(index.wavelengths[index.wavelengths > shortest], shortest)
             shortest = float(np.min(at / np.maximum(index(at).real, 1)))
         return order_solver(self.theory, self.height_field, shortest)
@@ -150,21 +144,16 @@ class ExportedGrating:
             yield DiffractedSide(side, orders, light.directions(orders, self.period, side == "reflected"), amplitudes)
 
 
-def material_of(chosen: Mapping[str, Any], parameters: Mapping[str, Any]) -> tuple[str | None, complex | str | None]:
-    """Return (material, int_ior), one of them None, from parameters or else those chosen in a recipe; n = 1.5 of none.
+def medium_in_air(chosen: Mapping[str, Any], parameters: Mapping[str, Any]) -> MediumBelow:
+    """Return the medium below a grating in air, from parameters or else those chosen in a recipe.
 
     Raises:
-        ValueError: if both are given, or the grating lies below another medium than air.
+        ValueError: as `MediumBelow.of`, or if the grating lies below another medium than air.
     """
     outside = {**chosen, **parameters}.get("ext_ior", 1)
     if outside != 1:
         raise RequestError(f"ext_ior: got {outside} of the recipe, wanted none: these orders are in air")
-    tables: list[Mapping[str, Any]] = [parameters, chosen, {"int_ior": 1.5}]
-    given = next(table for table in tables if {"material", "int_ior"} & table.keys())
-    material, int_ior = given.get("material"), given.get("int_ior")
-    if material is not None and int_ior is not None:
-        raise RequestError(f"material: got {material!r} and int_ior {int_ior}, wanted one of the two")
-    return material, int_ior
+    return MediumBelow.requested(parameters, chosen)
 
 
 def checked_ranges(wavelengths: ArrayLike, angles: ArrayLike, azimuths: ArrayLike) -> tuple[Real, Real, Real]:

@@ -71,7 +71,7 @@ def write_order_table(
         rows.writerow([*_COLUMNS, *(_JONES if rigorous else [])])
         for step, (w, b, a) in enumerate(np.ndindex(shape), 1):
             wavelength = float(wavelengths[w]) * 1e-3
-            light = IncidentLight(float(angles[a]), float(azimuths[b]), wavelength, grating.index(wavelength))
+            light = IncidentLight(float(angles[a]), float(azimuths[b]), wavelength, grating.below.at(wavelength))
             of_light = [f"{number:.9g}" for number in (wavelengths[w], angles[a], azimuths[b])]
             for side in grating.diffracted(light):
                 for row in _rows(side):

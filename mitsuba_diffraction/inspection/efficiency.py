@@ -14,12 +14,12 @@ from ..array_types import Real
 from ..errors import RequestError, is_number
 from ..files.outputs import MARK, METADATA
 from ..files.writing import whole_file
-from ..optics.materials import index_of
+from ..optics.media import MediumBelow
 from ..progress import Progress, silent
 from ..rigorous.coordinate_transformation import is_profile
 from ..settings import THEORIES, TRANSMISSIONS
 from ..surface.heightfield import HeightField
-from .order_solver import IncidentLight, index_at, order_solver
+from .order_solver import IncidentLight, order_solver
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -224,30 +224,42 @@ def efficiencies(
     """
     if not isinstance(height_field, HeightField):
         raise RequestError(f"height_field: got {type(height_field).__name__}, wanted a HeightField")
+    below = MediumBelow.of(material, int_ior)
+    return order_efficiencies(height_field, below, angles, wavelengths, azimuth, theory, transmission, progress)
+
+
+def order_efficiencies(
+    height_field: HeightField,
+    below: MediumBelow,
+    angles: ArrayLike,
+    wavelengths: ArrayLike,
+    azimuth: float,
+    theory: str,
+    transmission: str,
+    progress: Progress = silent,
+) -> OrderEfficiencies:
+    """Compute `efficiencies` of a grating above a medium; the same arguments, errors and warnings."""
     angles = checked_numbers("angles", angles, "degrees above −90 and below 90", -90.0, 90.0)
     wavelengths = checked_numbers("wavelengths", wavelengths, "nm from 10 to 100000 (100 µm)", 9.999, 100_000.001)
     if theory not in THEORIES:
         raise RequestError(f"theory: got {theory!r}, wanted one of {', '.join(THEORIES)}")
     if not is_number(azimuth) or not np.isfinite(azimuth):
         raise RequestError(f"azimuth: got {azimuth!r}, wanted degrees")
-    int_ior = 1.5 if material is None and int_ior is None else int_ior
     if transmission not in TRANSMISSIONS:
         raise RequestError(f"transmission: got {transmission!r}, wanted one of {', '.join(TRANSMISSIONS)}")
-    medium = None if int_ior is None else index_of("int_ior", int_ior)
-    if transmission != "none" and (medium is None or medium.absorbs):
-        absorbing = f"material {material!r}" if material is not None else f"int_ior {int_ior}"
-        raise RequestError(f"transmission: got {transmission!r} with {absorbing}, wanted a dielectric: int_ior, real")
+    below.check_theory(theory)
+    if transmission != "none" and not below.transparent:
+        raise RequestError(f"transmission: got {transmission!r} with {below}, wanted a transparent medium")
     if profile := is_profile(height_field):
         height_field = HeightField(height_field.heights[:1], height_field.pixel_size, height_field.source)
-    n = 1.0 if transmission == "none" or medium is None else np.maximum(medium(wavelengths * 1e-3).real, 1)
+    n = 1.0 if transmission == "none" or below.index is None else np.maximum(below.index(wavelengths * 1e-3).real, 1)
     # The maximum of |q| is (n_i + n_o)/λ.
     solver = order_solver(theory, height_field, 1e-3 * float(np.min(2 * wavelengths / (1 + n))))
     solve = {"none": solver.reflected, "interface": solver.transmitted, "sheet": solver.through_sheet}[transmission]
     found: dict[tuple[int, ...], Real] = {}
     for step, (a, w) in enumerate(np.ndindex(len(angles), len(wavelengths)), 1):
         wavelength = float(wavelengths[w]) * 1e-3
-        index = index_at(wavelength, material, int_ior, theory)
-        orders = solve(IncidentLight(float(angles[a]), azimuth, wavelength, index))
+        orders = solve(IncidentLight(float(angles[a]), azimuth, wavelength, below.at(wavelength)))
         for m, *pair in zip(orders.m, orders.s, orders.p, strict=True):
             of_order = found.setdefault(tuple(np.atleast_1d(m).tolist()), np.zeros((len(angles), len(wavelengths), 2)))
             of_order[a, w] = pair
@@ -258,25 +270,19 @@ def efficiencies(
         np.array(all_orders)[:, 0] if profile else np.array(all_orders),
         angles,
         wavelengths,
-        description(height_field.source, material, int_ior, azimuth, theory, transmission),
+        description(height_field.source, below, azimuth, theory, transmission),
     )
 
 
 def description(
-    source: str,
-    material: str | None,
-    int_ior: complex | str | None,
-    azimuth: float,
-    theory: str = "scalar",
-    transmission: str = "none",
+    source: str, below: MediumBelow, azimuth: float, theory: str = "scalar", transmission: str = "none"
 ) -> str:
-    """Return the description of a surface, material and theory, from arguments of `efficiencies`."""
-    what = material if material is not None else f"n = {int_ior if isinstance(int_ior, str) else f'{int_ior:g}'}"
+    """Return the description of a surface, the medium below it and the theory, as `efficiencies` takes them."""
     plane = f", plane of incidence at {azimuth:g}°" if azimuth else ""
     transmitted = {"none": "", "interface": ", transmitted orders inside", "sheet": ", transmitted by a sheet"}[
         transmission
     ]
-    return f"{source}; {what}, {theory} theory{transmitted}{plane}"
+    return f"{source}; {below}, {theory} theory{transmitted}{plane}"
 
 
 def checked_numbers(name: str, values: ArrayLike, wanted: str, low: float, high: float) -> Real:

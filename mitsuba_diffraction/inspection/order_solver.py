@@ -11,7 +11,6 @@ from .. import rigorous
 from ..array_types import Complex, Real
 from ..errors import RequestError
 from ..optics.geometry import Orders
-from ..optics.materials import refractive_index
 from ..rigorous.coordinate_transformation import curve_of
 from ..rigorous.solver import Efficiencies, sheet_orders
 from ..scalar_theory.closed_form import (
@@ -173,10 +172,3 @@ class RigorousSolver:
 def order_solver(theory: str, height_field: HeightField, shortest: float) -> OrderSolver:
     """Return the solver of a theory; arguments and errors of `ScalarSolver`, and of rigorous theory none."""
     return ScalarSolver(height_field, shortest) if theory == "scalar" else RigorousSolver(height_field)
-
-
-def index_at(wavelength: float, material: str | None, int_ior: complex | str | None, theory: str = "scalar") -> complex:
-    """Return n + ik at a wavelength in µm; in scalar theory infinite for material "none", the perfect mirror."""
-    if (theory, material, int_ior) == ("scalar", "none", None):
-        return complex("inf")
-    return refractive_index(wavelength, int_ior=int_ior, material=material, known=True)

@@ -19,13 +19,13 @@ from scipy.ndimage import gaussian_filter
 from ..array_types import Real
 from ..errors import RequestError
 from ..optics.geometry import fresnel
+from ..optics.media import MediumBelow
 from ..progress import Progress, silent
 from ..scalar_theory.closed_form import incident_direction, mirrored
 from ..spectrum.grids import OrderGrid
 from ..spectrum.power_spectrum import PowerSpectrum
 from ..surface.periods import Period
 from .efficiency import OrderEfficiencies, checked_numbers, description
-from .order_solver import index_at
 
 _MAX_SADDLE = 0.5  # of the lower of two peaks
 _EDGE = np.exp(-2.0)  # of its maximum, down to which a peak extends
@@ -82,8 +82,19 @@ def peak_efficiencies(
     Raises:
         ValueError: if an argument is out of range, or the orders of a tile do not overlap.
     """
-    int_ior = 1.5 if material is None and int_ior is None else int_ior
-    angles, wavelengths = check_request(spectrum.wavelengths, angles, wavelengths, material, int_ior)
+    return efficiencies_of_peaks(spectrum, MediumBelow.of(material, int_ior), angles, wavelengths, azimuth, progress)
+
+
+def efficiencies_of_peaks(
+    spectrum: PowerSpectrum,
+    below: MediumBelow,
+    angles: ArrayLike,
+    wavelengths: ArrayLike,
+    azimuth: float,
+    progress: Progress = silent,
+) -> PeakEfficiencies:
+    """Compute `peak_efficiencies` of a surface above a medium; the same arguments and errors."""
+    angles, wavelengths = check_request(spectrum.wavelengths, angles, wavelengths, below)
     spacing = [float(q[1] - q[0]) if len(q) > 1 else np.inf for q in spectrum.grid.frequencies()]
     if isinstance(spectrum.grid, OrderGrid) and max(spacing) > _MAX_SPACING * spectrum.lobe_width:
         raise RequestError(
@@ -97,7 +108,7 @@ def peak_efficiencies(
     for step, (a, w) in enumerate(np.ndindex(values.shape[1:3]), 1):
         wavelength, direction = float(wavelengths[w]) * 1e-3, incident_direction(float(angles[a]), azimuth)[:2]
         power, cos_half = _reflected(spectrum, direction, wavelength)
-        index, albedo = index_at(wavelength, material, int_ior), max(1.0, power.sum())
+        index, albedo = below.at(wavelength), max(1.0, power.sum())
         polarised = np.stack(fresnel(cos_half, index)) * power
         for k, (region, centre) in enumerate(zip(regions, centres, strict=True)):
             other = _reflected(spectrum, -direction - wavelength * centre, wavelength)[0].sum()
@@ -105,16 +116,12 @@ def peak_efficiencies(
         values[-1, a, w] = polarised[:, ~np.any(regions, axis=0)].sum(axis=1) / albedo
         progress(step, len(angles) * len(wavelengths))
     names = ["mirror", *(f"{sign}{name}" for name in _NAMES[: len(peaks)] for sign in "+-"), "rest"]
-    source = description(spectrum.source, material, int_ior, azimuth=azimuth)
+    source = description(spectrum.source, below, azimuth)
     return PeakEfficiencies(values, np.array(names), angles, wavelengths, source, peaks)
 
 
 def check_request(
-    valid: tuple[float, float],
-    angles: ArrayLike,
-    wavelengths: ArrayLike,
-    material: str | None,
-    int_ior: complex | str | None,
+    valid: tuple[float, float], angles: ArrayLike, wavelengths: ArrayLike, below: MediumBelow
 ) -> tuple[Real, Real]:
     """Return angles (a,) and wavelengths (w,) if the arguments of `peak_efficiencies` are right.
 
@@ -125,7 +132,7 @@ def check_request(
     wanted = f"nm from {low:g} to {high:g}, for which the spectrum is valid"
     wavelengths = checked_numbers("wavelengths", wavelengths, wanted, low - 1e-3, high + 1e-3)
     for wavelength in wavelengths:
-        index_at(wavelength * 1e-3, material, 1.5 if material is None and int_ior is None else int_ior)
+        below.at(wavelength * 1e-3)
     return checked_numbers("angles", angles, "degrees above −90 and below 90", -90.0, 90.0), wavelengths
 
 

@@ -50,7 +50,7 @@ from typing import Any
 
 from ..errors import RequestError, check_whole, did_you_mean
 from ..files.writing import cache_folder, examples_folder, refuse_special
-from ..optics.materials import is_file
+from ..optics.media import index_files
 from ..progress import Progress, no_progress, part, silent, stage
 from ..settings import SPECTRUM_PARAMETERS, ScalarSettings, Settings
 from ..surface.gratings import COHERENCE_LENGTHS, PATCHES, PROFILES, profile_name
@@ -222,9 +222,8 @@ class Recipe:
             if not (isinstance(surface, dict) and isinstance(spectrum, dict)):
                 raise RequestError("wanted the tables [surface] and [spectrum]")
             # Files are named relative to the recipe, wherever the process goes.
-            of_files = {name for name in ("material", "int_ior") if is_file(spectrum.get(name))}
             folder = path.parent.absolute()
-            spectrum = {**spectrum, **{name: str(folder / spectrum[name]) for name in of_files}, **settings}
+            spectrum |= {name: str(folder / file) for name, file in index_files(spectrum).items()} | settings
             _refuse_unknown("[spectrum]", spectrum, frozenset(SPECTRUM_PARAMETERS))
             _refuse_other_values(spectrum)
             return cls(surface, Settings.of(**spectrum), folder)
@@ -236,7 +235,7 @@ class Recipe:
     def files(self) -> list[Path]:
         """The files that the recipe names, if any: its scan, and the file of an index."""
         scans = [self.folder / self.surface["scan"]] if "scan" in self.surface else []
-        return scans + ([Path(str(index))] if is_file(index := self.settings.chosen.get("material")) else [])
+        return scans + list(index_files(self.settings.chosen).values())
 
     @property
     def patches(self) -> int:
@@ -327,8 +326,7 @@ class Recipe:
             content.update(scan.read_bytes())
             content.update(scan.suffix.lower().encode())
         settings = self.settings.chosen
-        if is_file(material := settings.get("material")):
-            settings["material"] = Path(str(material)).name
+        settings |= {name: file.name for name, file in index_files(settings).items()}
         # By values: 1200 and 1200.0 are one number.
         surface, settings = json.loads(json.dumps((surface, settings), default=str), parse_int=float)
         request = surface, self.patches, settings

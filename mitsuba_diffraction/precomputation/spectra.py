@@ -13,7 +13,6 @@ import numpy as np
 
 from ..errors import RequestError
 from ..files.writing import cache_folder
-from ..optics.materials import index_of
 from ..progress import Progress, silent
 from ..rigorous import build_table as rigorous
 from ..rigorous.rigorous_spectrum import RIGOROUS_FORMAT as RIGOROUS_FORMAT
@@ -119,11 +118,13 @@ def check_material(settings: Settings) -> None:
     Raises:
         RequestError: if it is not.
     """
-    if not isinstance(settings, RigorousSettings) or not settings.material:
+    if not isinstance(settings, RigorousSettings):
         return
+    below = rigorous.medium_below(settings)
     shortest, longest = (wavelength * settings.ext_ior for wavelength in settings.wavelengths)
     try:
-        index_of("material", settings.material).known("material").check((shortest, longest))
+        for known in below.known:
+            known.check((shortest, longest))
     except RequestError as error:
         if settings.ext_ior == 1:
             raise

@@ -21,7 +21,7 @@ from numpy.typing import NDArray
 from ..array_types import Real
 from ..errors import RequestError
 from ..files.writing import whole_file
-from ..optics.materials import index_of, refractive_index
+from ..optics.media import MediumBelow
 from ..progress import Progress, silent, stage
 from ..settings import RigorousSettings, usable_cores
 from ..surface.heightfield import HeightField
@@ -113,8 +113,10 @@ def build_rigorous(
         UserWarning: if `error` of the finest table exceeds the tolerance, or `polarisation_error` three times that.
     """
     tolerance = 1e-2 if settings.tolerance is None else settings.tolerance
-    material = settings.material
-    stored = replace(settings, tolerance=float(tolerance), material=material and Path(material).name)
+    name = settings.material or (settings.int_ior if isinstance(settings.int_ior, str) else None)
+    stored = replace(settings, tolerance=float(tolerance))
+    if name:
+        stored = replace(stored, material=Path(name).name, int_ior=None)
     period = height_field.tile_size[0]
     max_period = MAX_PERIOD_IN_WAVELENGTHS * settings.wavelengths[0] * 1e-3
     if period > max_period:
@@ -136,7 +138,7 @@ def build_rigorous(
                 values=values,
                 mueller=mueller,
                 settings=stored,
-                material_digest=index_of("material", material).digest if material else "",
+                material_digest=surface.below.digest if name else "",
                 harmonics=surface.harmonics,
                 source=height_field.source,
                 source_digest=height_field.digest,
@@ -157,31 +159,46 @@ def build_rigorous(
     return spectrum
 
 
+def medium_below(settings: RigorousSettings) -> MediumBelow:
+    """Return the medium below the surface of a table, which a scene does not know: there is no default.
+
+    Raises:
+        RequestError: as `MediumBelow.of`, or if there is none, or it is the perfect mirror.
+    """
+    if settings.material is None and settings.int_ior is None:
+        raise RequestError("int_ior, material: got neither with theory=rigorous, wanted one of the two")
+    below = MediumBelow.of(settings.material, settings.int_ior)
+    below.check_theory(settings.theory)
+    return below
+
+
 class _SolvedSurface:
-    """A surface, its material and the solver for them.
+    """A surface, the medium below it and the solver for them.
 
     Attributes:
+        below: n + ik below.
         harmonics: N, which keeps a tenth of the tolerance at the shortest wavelength.
     """
 
     def __init__(self, height_field: HeightField, settings: RigorousSettings, tolerance: float) -> None:
         self.period = height_field.tile_size[0]
         self.wavelengths = settings.wavelengths[0] * 1e-3, settings.wavelengths[1] * 1e-3
-        self.material = settings.int_ior, settings.material, settings.ext_ior
+        index = medium_below(settings).index
+        assert index is not None
+        self.below, self.ext_ior = index, settings.ext_ior
         self.tolerance = tolerance
         self.transmission = settings.transmission
         curve = curve_of(height_field)
         self.harmonics = max(self._harmonics(curve, np.array(d) / np.linalg.norm(d)) for d in _HARMONICS_DIRECTIONS)
         # The table uses the first. The others serve light that needs more harmonics, and the checks.
         self.gratings = [CurveMatrices(curve, int(1.4**k * self.harmonics)) for k in range(5)]
-        medium = settings.int_ior if settings.material is None else index_of("material", settings.material).digest
-        request = height_field.digest, self.wavelengths, medium, settings.ext_ior, settings.polarised, self.transmission
-        self.digest = hashlib.sha256(repr((request, self.harmonics, BUILD_VERSION)).encode()).hexdigest()
+        media = self.below.digest, settings.ext_ior, self.transmission
+        request = height_field.digest, self.wavelengths, media, settings.polarised, self.harmonics, BUILD_VERSION
+        self.digest = hashlib.sha256(repr(request).encode()).hexdigest()
 
     def index(self, wavelength: float) -> complex:
         """Return n + ik below, relative to the medium above, for a wavelength in µm in the medium above."""
-        int_ior, material, ext_ior = self.material
-        return refractive_index(wavelength * ext_ior, int_ior=int_ior, material=material) / ext_ior
+        return complex(self.below(wavelength * self.ext_ior)) / self.ext_ior
 
     def _harmonics(self, curve: Curve, omega: Real) -> int:
         """Return the smallest N that keeps a tenth of the tolerance at the shortest wavelength."""

@@ -20,6 +20,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from ..array_types import Real
 from ..errors import RequestError
+from ..optics.media import MediumBelow
 from ..settings import RigorousSettings, lobe_cutoff, lobe_width
 from ..spectrum.exr import doubles, one_line, read_channels, write_channels
 from ..spectrum.grids import OrderGrid
@@ -258,8 +259,8 @@ class RigorousSpectrum:
         values: η at the nodes, (rows, F, X, Z).
         mueller: M_ij at the nodes, (rows, F, X, Z, 4, 4), or None. Elements that are odd in k_y are divided by k_y/ν,
             so that all are smooth at k_y = 0.
-        settings: the parameters it was built with. The tolerance is a number, and a file that is the material is named
-            without its folder.
+        settings: the parameters it was built with. The tolerance is a number; a medium with a name is `material`, and a
+            file is named without its folder.
         material_digest: SHA-256 of the index of the material; empty for an index that is a number.
         error: the mean of Σ|Δη_m| / Σ η_m, measured at directions (uniform over the hemisphere) and wavelengths that
             were not used to build the table. Sums are over all outgoing orders, above and below; with transmission,
@@ -363,6 +364,14 @@ class RigorousSpectrum:
             return f"material {self.settings.material}{medium}"
         index = self.int_ior.real if np.imag(self.int_ior) == 0 else self.int_ior
         return f"int_ior {index:.6g}{medium}"
+
+    def is_of(self, below: MediumBelow) -> bool:
+        """Return whether the table is of this medium; a number is the index relative to the medium above."""
+        if below.index is None:
+            return False
+        if below.index.is_constant:
+            return abs(below.index.nominal - self.int_ior) < 1e-3 * abs(self.int_ior)
+        return below.index.digest == self.material_digest
 
     @property
     def megabytes(self) -> float:

@@ -14,6 +14,7 @@ import numpy as np
 from ..errors import RequestError, did_you_mean, is_number, shell_command
 from ..files.writing import examples_folder
 from ..optics.materials import refractive_index
+from ..optics.media import DEFAULT_INT_IOR
 from ..precomputation.grating_spectrum import GratingSpectrum
 from ..precomputation.recipe import Recipe, parameters_of_profile, source_named
 from ..precomputation.spectra import Spectrum, load_spectrum
@@ -52,7 +53,7 @@ class ViewedMaterial:
         coat_ior: index of a clear layer over the grating; one of none.
     """
 
-    int_ior: float = 1.5
+    int_ior: float = DEFAULT_INT_IOR
     material: str = ""
     orientation: float | str = 0.0
     height_scale: float = 1.0

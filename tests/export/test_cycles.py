@@ -15,6 +15,7 @@ from scipy.special import jv
 import mitsuba_diffraction as md
 from mitsuba_diffraction.export.cycles import write_shader
 from mitsuba_diffraction.optics.color import SRGB_TO_XYZ, delta_E, linear_sRGB_to_XYZ
+from mitsuba_diffraction.optics.media import MediumBelow
 
 
 def array(text, name):
@@ -57,7 +58,7 @@ def test_a_continuum_holds_all_of_its_power_in_cells(tmp_path):
     smooth = ndimage.gaussian_filter(np.random.default_rng(3).standard_normal((80, 80)), 4, mode="wrap")
     surface = md.HeightField(0.1 * smooth / smooth.std(), 0.09)
     spectrum = md.precompute(surface, extent="sample", coherence_length=3.0, tolerance=0.05)
-    assert "96 × 32 frequencies" in write_shader(spectrum, tmp_path / "c.osl", material="none")
+    assert "96 × 32 frequencies" in write_shader(spectrum, tmp_path / "c.osl", MediumBelow.of("none"))
     text = (tmp_path / "c.osl").read_text(encoding="utf-8")
     rows, columns = array(text, "Rows"), array(text, "Columns").reshape(32, 97)
     powers = array(text, "Powers").reshape(32 * 96, -1)

@@ -11,6 +11,7 @@ import mitsuba_diffraction as md
 from mitsuba_diffraction.export.exported_grating import ExportedGrating
 from mitsuba_diffraction.export.order_table import write_order_table
 from mitsuba_diffraction.optics.geometry import fresnel
+from mitsuba_diffraction.optics.media import MediumBelow
 
 SCATMECH = json.loads((Path(__file__).parents[1] / "data" / "scatmech_orders.json").read_text(encoding="utf-8"))
 
@@ -24,7 +25,7 @@ def rows_of(path):
 
 
 def table(path, surface, wavelengths, angles, azimuths=0.0, theory="rigorous", material=None, int_ior=None):
-    grating = ExportedGrating(surface, theory, material, int_ior, np.min(wavelengths) * 1e-3)
+    grating = ExportedGrating(surface, theory, MediumBelow.of(material, int_ior), np.min(wavelengths) * 1e-3)
     count = write_order_table(grating, path, wavelengths, angles, azimuths)
     rows = rows_of(path)
     assert len(rows) == count
@@ -208,3 +209,41 @@ def test_the_far_infrared_of_a_table_adds_no_orders(tmp_path):
     found, wanted = (table(tmp_path / "a.csv", tile, 600, 20, theory="scalar", int_ior=index) for index in indices)
     assert [list(row.values())[:7] for row in found] == [list(row.values())[:7] for row in wanted]
     np.testing.assert_allclose(*([row["efficiency"] for row in rows] for rows in (found, wanted)), atol=1e-8)
+
+
+@pytest.mark.parametrize("theory", ["scalar", "rigorous"])
+def test_glass_transmits_however_it_is_named(theory, command, tmp_path, monkeypatch):
+    """A recipe with the index as a number has been right; n at 550 nm of the data sheet."""
+    monkeypatch.chdir(tmp_path)
+    index = 1.51852
+    (tmp_path / "glass.csv").write_text(f"wl,n\n0.3,{index}\n1.1,{index}\n")
+    surface = '[surface]\nprofile = "sinusoidal"\nperiod = 1.3\ndepth = 0.1\n[spectrum]\ntheory = "rigorous"\n'
+
+    def rows(*named):
+        found = []
+        for number, (name, value) in enumerate(named):
+            recipe = tmp_path / f"{number}.toml"
+            recipe.write_text(f"{surface}{name} = {value!r}\n")
+            for text in (
+                f"{recipe},theory={theory}",
+                f"sinusoidal,period=1.3,depth=0.1,theory={theory},{name}={value}",
+            ):
+                line = ("export", text, "-o", "o.csv", "--wavelength", "550", "--angle", "10", "--overwrite")
+                assert command(*line)[0] == 0
+                found.append(rows_of("o.csv"))
+            code, said, _ = command(
+                "efficiency", f"{recipe},theory={theory},transmission=interface", "--wavelength", "550"
+            )
+            assert (code, "transmitted orders inside" in said) == (0, True)
+        return found
+
+    wanted, *others = rows(
+        ("int_ior", index), *((name, value) for name in ("int_ior", "material") for value in ("BK7", "glass.csv"))
+    )
+    transmitted = sum(row["efficiency"] for row in chosen(wanted, side="transmitted", polarisation="mean"))
+    reflected = sum(row["efficiency"] for row in chosen(wanted, side="reflected", polarisation="mean"))
+    assert transmitted > 0.94
+    assert transmitted + reflected == pytest.approx(1, abs=2e-3 if theory == "rigorous" else 0.02)
+    for other in others:
+        assert [(row["side"], row["m"]) for row in other] == [(row["side"], row["m"]) for row in wanted]
+        np.testing.assert_allclose(*([row["efficiency"] for row in some] for some in (other, wanted)), atol=2e-5)
