@@ -15,6 +15,7 @@ from ..errors import RequestError, is_number
 from ..settings import VISIBLE
 
 _CHECKED = 32  # points along u and v at which a base is checked
+_MIN_SPECULAR = 0.04  # albedo of a base that reflects specularly, too, about that of a varnish
 
 living: weakref.WeakSet[mi.BSDF] = weakref.WeakSet()  # the gratings of all scenes
 
@@ -116,6 +117,7 @@ class Base:
         self.components = [bsdf.flags(i) & ~+mi.BSDFFlags.BackSide for i in range(bsdf.component_count())]
         self.has_delta = bool(flags & +mi.BSDFFlags.DeltaReflection)
         self._is_diffuse = bool(flags & +mi.BSDFFlags.DiffuseReflection)
+        self._is_specular = bool(flags & +(mi.BSDFFlags.GlossyReflection | mi.BSDFFlags.DeltaReflection))
         self.check()
 
     def check(self) -> None:
@@ -150,8 +152,8 @@ class Base:
         return inner
 
     def albedo(self, si: mi.SurfaceInteraction3f, active: mi.Bool) -> mi.Float:
-        """Estimate the albedo, averaged over the wavelengths, for the choice of samples."""
+        """Estimate the albedo, averaged over the wavelengths, for the choice of samples; zero only if there is none."""
         if not self._is_diffuse:
             return mi.Float(1.0)
         value = mi.unpolarized_spectrum(self.bsdf.eval_diffuse_reflectance(si, active))
-        return dr.clip(dr.mean(value), 0, 1)
+        return dr.clip(dr.mean(value), _MIN_SPECULAR if self._is_specular else 0, 1)

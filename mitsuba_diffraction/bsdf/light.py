@@ -1,4 +1,4 @@
-"""The wavelengths of the light in a scene, which the tables of its gratings must cover."""
+"""The wavelengths of the light in a scene, which the tables of its gratings must cover, and surfaces without light."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from ..settings import VISIBLE
 from ..variants import is_supported
 from .base import gratings_in, parts
 
-STEP = 0.25  # nm, less than the width of a lamp's lines
+STEP = 0.25  # nm, less than the width of lines
 
 
 def recorded_wavelengths(film: mi.Film) -> tuple[float, float]:
@@ -61,15 +61,45 @@ def cover_light(scene: mi.Scene, sensor: mi.Sensor | int | None = None) -> None:
 def _emits(emitter: mi.Emitter, low: float, high: float) -> bool:
     """Return whether a light may emit in [low, high] nm.
 
-    Lights without a spectrum are assumed to emit all visible light.
+    Lights without a spectrum are assumed to emit all visible light. A spectrum need not be that of the emission (that
+    of `sunsky` is the albedo of the ground): a light is dark only where all its spectra and its samples are zero.
 
     Samples of wavelengths do not answer this: for some spectra Mitsuba draws samples from a part of their range.
     """
-
     spectra = parts(emitter, mi.Texture)
     if not spectra or any(spectrum.is_spatially_varying() for spectrum in spectra):
         return low < VISIBLE[1] and high > VISIBLE[0]
+    si = _at_wavelengths(low, high)
+    rng = mi.PCG32(size=dr.width(si.wavelengths))
+    values = [spectrum.eval(si) for spectrum in spectra]
+    if not any(dr.any(value > 0, axis=None) for value in values):
+        _, value = emitter.sample_direction(si, mi.Point2f(rng.next_float32(), rng.next_float32()))
+        values = [mi.unpolarized_spectrum(value)]
+    return any(bool(dr.any(value > 0, axis=None)) for value in values)
+
+
+def is_black(bsdf: mi.BSDF | None, low: float, high: float) -> bool:
+    """Return whether a BSDF is known to reflect and transmit nothing in [low, high] nm, as that of lamps by default.
+
+    Only a surface that is diffuse and equal everywhere is evaluated: the values of others at some directions and points
+    say nothing of the rest.
+    """
+    if bsdf is None:
+        return True
+    is_diffuse = bsdf.flags() == mi.BSDFFlags.DiffuseReflection | mi.BSDFFlags.FrontSide
+    if not is_diffuse or any(texture.is_spatially_varying() for texture in parts(bsdf, mi.Texture)):
+        return False
+    si = _at_wavelengths(low, high)
+    rng = mi.PCG32(size=dr.width(si.wavelengths))
+    si.uv = mi.Point2f(rng.next_float32(), rng.next_float32())
+    si.wi = mi.Vector3f(0.6, 0.0, 0.8)
+    value = mi.unpolarized_spectrum(bsdf.eval(mi.BSDFContext(), si, mi.Vector3f(0.0, 0.6, 0.8)))
+    return bool(dr.all(value == 0, axis=None))
+
+
+def _at_wavelengths(low: float, high: float) -> mi.SurfaceInteraction3f:
+    """Return interactions at wavelengths spread over [low, high] nm."""
     wavelengths = np.arange(low + STEP / 2, high, STEP)
     si = dr.zeros(mi.SurfaceInteraction3f, wavelengths.size)
     si.wavelengths = type(si.wavelengths)(mi.Float(wavelengths.astype(np.float32)))
-    return any(bool(dr.any(spectrum.eval(si) > 0, axis=None)) for spectrum in spectra)
+    return si

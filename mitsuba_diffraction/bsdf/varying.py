@@ -118,8 +118,12 @@ def check_texture(name: str, texture: mi.Texture) -> None:
     for key in parameters.keys():  # noqa: SIM118
         if key.split(".")[-1] in ("to_uv", "range"):
             continue
-        if not np.isfinite(np.array(dr.detach(parameters[key]), np.float64)).all():
+        values = np.array(dr.detach(parameters[key]), np.float64)
+        if not np.isfinite(values).all():
             raise RequestError(f"{name}: got values that are not finite, wanted numbers")
+        # Coefficients of an upsampled spectrum.
+        if key.split(".")[-1] == "value" and values.size > 1:
+            raise RequestError(f"{name}: got colours, wanted numbers")
     if "data" not in parameters:
         return
     try:

@@ -6,9 +6,9 @@ from typing import Any
 
 import drjit as dr
 import mitsuba as mi
-import numpy as np
 
 from ..bsdf.base import nested_plugin
+from ..bsdf.light import is_black, recorded_wavelengths
 from ..errors import RequestError
 from ..parameter_documentation import Parameter, listed
 from .paths import Gratings, LightPaths, define_eye_paths, implements, unpacked
@@ -88,7 +88,8 @@ def define() -> type:
             eye = eye_class(scene, sensor, gratings, self.max_depth, self.rr_depth)
             if 0 <= self.max_depth < 3 or not gratings.shapes:
                 return (eye if eye.candidates.any or eye.lamps.any else self.path), None
-            if all(shape in gratings or _is_black(shape.bsdf()) for shape in scene.shapes()):
+            recorded = recorded_wavelengths(sensor.film())
+            if all(shape in gratings or is_black(shape.bsdf(), *recorded) for shape in scene.shapes()):
                 return eye, None
             return eye, LightPaths(scene, sensor, gratings, self.max_depth, self.rr_depth)
 
@@ -172,13 +173,6 @@ def _lit_gratings(scene: mi.Scene, sensor: mi.Sensor, max_depth: int) -> Grating
             "sample_border: got true, wanted false: points outside the film's edge cannot be connected to it"
         )
     return gratings
-
-
-def _is_black(bsdf: mi.BSDF | None) -> bool:
-    """Return whether a surface reflects nothing, as lamps do by default, and shows no light cast by gratings."""
-    return bsdf is None or (
-        bsdf.class_name() == "SmoothDiffuse" and all(not np.any(np.array(value)) for _, value in mi.traverse(bsdf))
-    )
 
 
 def _trace_eye_paths(scene: mi.Scene, sensor: mi.Sensor, eye: Any, seed: mi.UInt32 | int, spp: int) -> int:

@@ -349,3 +349,15 @@ def test_a_reflectance_changed_to_a_negative_one_is_refused(llvm, reflectance, k
 def test_a_negative_reflectance_is_refused(llvm):
     with pytest.raises(RuntimeError, match=NEGATIVE):
         mi.load_dict(grating(int_ior=1.5, base={"type": "diffuse", "reflectance": uniform(-5)}))
+
+
+@pytest.mark.slow
+def test_a_varnish_without_diffuse_light_is_sampled_below_a_coat_of_its_index():
+    """Regression: only the face of the coat was, as the grating reflects nothing and the base no diffuse light."""
+    varnish = {"type": "plastic", "diffuse_reflectance": uniform(0.0), "int_ior": 1.5, "ext_ior": 1.0}
+    bsdf = {"type": "diffraction_grating", "profile": "blazed", "coherence_length": 3.0, "base": varnish}
+    bsdf = mi.load_dict({**bsdf, "int_ior": 1.5, "ext_ior": 1.0, "coat_ior": 1.5})
+    bs, weight = draw(bsdf, direction(37, 0), 1 << 16)
+    of_base = np.array(bs.sampled_component) == 1
+    reflectance = np.array(mi.fresnel(mi.Float(np.cos(np.deg2rad(37))), 1.5)[0]).item()
+    assert np.where(of_base, weight, 0).mean() == pytest.approx((1 - reflectance) ** 2 * reflectance, rel=0.05)

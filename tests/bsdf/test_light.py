@@ -9,6 +9,7 @@ from bsdf_support import albedo, direction, made_up, plugin
 
 import mitsuba_diffraction as md
 from mitsuba_diffraction.bsdf.base import gratings_in
+from mitsuba_diffraction.bsdf.light import _emits
 from mitsuba_diffraction.settings import ScalarSettings
 
 WAVELENGTHS = (450.0, 530.0, 600.0, 700.0)
@@ -122,6 +123,12 @@ def test_wavelengths_without_light_need_no_table(llvm):
     (bsdf,) = {bsdf for shape in loaded.shapes() for bsdf in gratings_in(shape.bsdf())}
     shortest, longest = bsdf.layers.grating.theory.light
     assert 500 <= shortest <= 530 < 534 <= longest
+
+
+def test_a_spectrum_that_is_not_of_the_emission_does_not_make_a_light_dark(llvm):
+    """`sunsky` has one, the albedo of the ground; its light needs a table all the same."""
+    built = mi.load_dict({"type": "scene", "sky": {"type": "sunsky", "albedo": 0.0}})
+    assert _emits(built.emitters()[0], 600, 700)
 
 
 @pytest.mark.parametrize("change", ["another sensor", "another light"])

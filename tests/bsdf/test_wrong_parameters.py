@@ -40,6 +40,10 @@ def test_a_whole_number_is_an_index(llvm):
             {"orientation": {"type": "checkerboard", "color0": float("nan")}},
             "orientation: got values that are not fini",
         ),
+        (
+            {"orientation": {"type": "checkerboard", "color0": {"type": "rgb", "value": [0.5, 0.5, 0.5]}}},
+            "orientation: got colours, wanted numbers",
+        ),
     ],
 )
 def test_numbers_that_cannot_be_are_refused(llvm, parameters, message):

@@ -9,8 +9,9 @@ import numpy as np
 import pytest
 from bsdf_support import bitmap, grating, uniform
 
-import mitsuba_diffraction  # noqa: F401 (settles which LLVM is used before a variant is set)
+from mitsuba_diffraction import testing
 from mitsuba_diffraction.evaluation.benchmark.noise import load_for_noise
+from mitsuba_diffraction.integrator.candidates import _marks_failure
 from mitsuba_diffraction.integrator.unshadowed_light import UnshadowedLight
 from mitsuba_diffraction.render.trace_pass import trace_pass
 
@@ -321,3 +322,30 @@ def assert_bins_agree(name, depth):
 @pytest.mark.parametrize("name", ["compact_disc", "hologram", "elaphe", "xenopeltis"])
 def test_every_bin_of_a_scene_agrees_with_path(name, depth, llvm):
     assert_bins_agree(name, depth)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("kind", ["grating", "twosided", "normalmap", "bumpmap"])
+def test_a_sample_that_fails_lies_in_the_surface_or_has_no_value(kind, llvm):
+    """The names of these classes of Mitsuba stand for it where candidates are drawn without their densities."""
+    nested = surface("blazed", 1.5)
+    tilted = bitmap(np.tile((np.array([0.5, 0, 0.75**0.5]) + 1) / 2, (2, 2, 1)))
+    bsdf = {
+        "grating": nested,
+        "twosided": {"type": "twosided", "bsdf": nested},
+        "normalmap": {"type": "normalmap", "normalmap": tilted, "bsdf": nested},
+        "bumpmap": {"type": "bumpmap", "texture": bitmap(np.arange(64.0).reshape(8, 8) / 64), "bsdf": nested},
+    }[kind]
+    count, rng = 1 << 16, np.random.default_rng(1)
+    wi = rng.normal(size=(count, 3))
+    built = mi.load_dict(bsdf)
+    assert _marks_failure(built)
+    wi /= np.linalg.norm(wi, axis=1, keepdims=True)
+    uv = rng.random((count, 2))
+    wo, _, bs = testing.sample(built, wi, WAVELENGTHS, 1, None, uv)
+    failed = np.array(bs.pdf) == 0
+    assert kind == "twosided" or failed.sum() > 100
+    assert failed[wo[:, 2] == 0].all()
+    # Such as those of light from below.
+    value = testing.evaluate_pdf(built, wi, wo, WAVELENGTHS, None, uv)[0]
+    assert not value[failed & (wo[:, 2] != 0)].any()

@@ -365,9 +365,23 @@ def test_few_light_paths_have_the_expectation_of_many(llvm, monkeypatch):
     assert (error < 0.02 * many.max()).all()
 
 
-@pytest.mark.parametrize(("reflectance", "traces"), [(0.0, False), (0.1, True)])
-def test_light_paths_are_traced_only_if_a_surface_reflects_them(reflectance, traces, llvm):
-    lamp = {**plate(diffuse(reflectance), height=2.0), "emitter": {"type": "area", "radiance": uniform(1.0)}}
+@pytest.mark.parametrize(
+    ("bsdf", "traces"),
+    [
+        (diffuse(0.0), False),
+        (diffuse(0.1), True),
+        # The coefficients of Mitsuba's upsampled grey are 0, 0, 0; those of black are 0, 0, −8192.
+        ({"type": "diffuse", "reflectance": {"type": "rgb", "value": [0.5, 0.5, 0.5]}}, True),
+        ({"type": "diffuse", "reflectance": {"type": "rgb", "value": [0.0, 0.0, 0.0]}}, False),
+        ({"type": "diffuse", "reflectance": {"type": "rgb", "value": [0.0, 0.0, 0.7]}}, True),
+        ({"type": "diffuse", "reflectance": {"type": "spectrum", "value": [(600, 0), (601, 1), (602, 0)]}}, True),
+        ({"type": "diffuse", "reflectance": {"type": "checkerboard", "color0": 0.0, "color1": 0.0}}, True),
+        ({"type": "twosided", "bsdf": diffuse(0.2)}, True),
+        ({"type": "conductor"}, True),
+    ],
+)
+def test_light_paths_are_traced_only_if_a_surface_reflects_them(bsdf, traces, llvm):
+    lamp = {**plate(bsdf, height=2.0), "emitter": {"type": "area", "radiance": uniform(1.0)}}
     built = scene(floor=plate(blaze(), 4, 0), wall=plate(blaze(), 0.5), lamp=lamp)
     eye, light = mi.load_dict({"type": "diffraction_path", "max_depth": 3}).parts(built, built.sensors()[0])
     assert type(eye).__name__ == "EyePaths"

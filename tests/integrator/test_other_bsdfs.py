@@ -96,10 +96,3 @@ def test_a_tinted_bsdf_is_no_noisier_than_with_path(llvm):
     (wanted, its_error), (found, error) = (region_means(built, each, 256, 48) for each in integrators)
     np.testing.assert_array_less(np.abs(found - wanted), 4 * np.hypot(its_error, error))
     assert error.max() < its_error.max()
-
-
-def test_a_diffuse_surface_with_a_colour_is_not_black(llvm):
-    # Regression: a colour in a scene ended the rendering.
-    from mitsuba_diffraction.integrator.diffraction_path import _is_black
-
-    assert not _is_black(mi.load_dict({"type": "diffuse", "reflectance": rgb(0.0, 0.0, 0.7)}))
