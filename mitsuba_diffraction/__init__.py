@@ -16,6 +16,7 @@ from .registration.import_hook import register as _register
 if TYPE_CHECKING:  # type checkers do not see what is imported on first use
     from . import rigorous
     from .bsdf import testing
+    from .files.writing import examples_folder
     from .inspection.efficiency import efficiencies
     from .inspection.peaks import peak_efficiencies
     from .inverse_design import design
@@ -36,6 +37,7 @@ _HOME = {
     "design": "inverse_design",
     "efficiencies": "inspection.efficiency",
     "example_scene": "render.example_scene",
+    "examples_folder": "files.writing",
     "gratings": "surface.gratings",
     "peak_efficiencies": "inspection.peaks",
     "precompute": "precomputation.spectra",
@@ -53,6 +55,7 @@ __all__ = [
     "design",
     "efficiencies",
     "example_scene",
+    "examples_folder",
     "gratings",
     "peak_efficiencies",
     "precompute",

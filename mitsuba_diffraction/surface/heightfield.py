@@ -144,8 +144,8 @@ def _refuse(gaps: NDArray[np.bool_]) -> None:
         row, column = np.argwhere(gaps)[0]
         raise RequestError(
             f"heights: {gaps.sum()} of {gaps.size} pixels are missing or not finite, "
-            f"the first at row {row}, column {column}; wanted finite heights in µm "
-            "(fill_missing=True fills them from their surroundings)"
+            f"the first at row {row}, column {column}; wanted finite heights in µm, or fill_missing, which "
+            "interpolates them from their surroundings"
         )
 
 

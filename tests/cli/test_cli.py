@@ -83,7 +83,7 @@ def files():
         ("precompute blaze.toml --tolerance", "--tolerance: got no value"),
         ("precompute blaze.toml --pixel-sise 1", "No such option: --pixel-sise"),
         ("precompute holed.npy,pixel_size=0.05", "1 of 48 pixels are missing"),
-        ("precompute holed.npy,pixel_size=0.05", "fill_missing=True fills them from their surroundings"),
+        ("precompute holed.npy,pixel_size=0.05", "or fill_missing, which interpolates them from their surroundings"),
         ("precompute blaze.toml -o out.png", "out.png"),
         ("precompute blaze.toml -o out", "ends in .exr"),
         ("precompute blaze.toml -o nowhere/out.exr", "nowhere/out.exr"),

@@ -473,7 +473,7 @@ def test_a_scan_is_validated_with_the_values_that_other_commands_take(command, t
     assert seen == [(1, "sample"), (1, "tile")]
     code, _, error = command("validate", scan)
     assert code == 2
-    assert "fill_missing=True" in error
+    assert "or fill_missing, which interpolates" in error
 
 
 def test_results_are_plain_json(tmp_path):

@@ -151,7 +151,7 @@ def read_height_field(
             fraction = np.ma.getmaskarray(scan.numbers).mean()
             raise RequestError(
                 f"{fraction:.2%} of the pixels are coloured, annotation on a grey picture; they can be "
-                "treated as missing and filled from their surroundings (fill_missing=True)"
+                "treated as missing, and fill_missing interpolates them from their surroundings"
             )
         doubt = scan.doubt if pixel_size is None else ""
         pixel_size = scan.pixel_size if pixel_size is None else pixel_size
