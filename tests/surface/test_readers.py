@@ -1,8 +1,8 @@
 """Files to height fields: round trips of every format of the core, and one line for every misuse."""
 
 import struct
+import warnings
 import zlib
-from contextlib import nullcontext
 
 import gwyfile
 import numpy as np
@@ -427,12 +427,48 @@ def test_gwy_provides_its_scale_and_the_top_row_is_the_first(tmp_path):
     assert read_height_field(tmp_path / "scan.gwy", pixel_size=0.5).pixel_size == (0.5, 0.5)
 
 
-@pytest.mark.parametrize(("unit", "scale"), [("m", 1.0), ("um", 1e-6), ("µm", 1e-6), ("nm", 1e-9), ("Å", 1e-10)])
-def test_gwy_units_are_converted(tmp_path, unit, scale):
-    write_gwy(tmp_path / "scan.gwy", {3: ("Z", gwy_field(z=unit))})
-    with nullcontext() if scale * np.ptp(HEIGHTS) > 2e-4 else pytest.warns(UserWarning, match="is their unit right"):
-        field = read_height_field(tmp_path / "scan.gwy")
-    np.testing.assert_allclose(field.heights, HEIGHTS * scale, rtol=1e-12)
+def write_field(path, heights, size, xy, z):
+    """The same field as .gwy or .gsf; numbers as they stand in the file."""
+    if path.suffix == ".gwy":
+        size = {"xreal": size[0], "yreal": size[1]}
+        field = gwyfile.objects.GwyDataField(np.asarray(heights), si_unit_xy=xy, si_unit_z=z, **size)
+        container = gwyfile.objects.GwyContainer()
+        container["/0/data"] = field
+        container.tofile(str(path))
+    else:
+        sizes = f"XRes = 3\nYRes = 2\nXReal = {size[0]}\nYReal = {size[1]}\nXYUnits = {xy}\nZUnits = {z}\n"
+        write_gsf(path, f"Gwyddion Simple Field 1.0\n{sizes}", heights)
+
+
+@pytest.mark.parametrize("name", ["scan.gwy", "scan.gsf"])
+@pytest.mark.parametrize("xy", ["m", "um", "nm"])
+@pytest.mark.parametrize("z", ["m", "µm", "Å"])
+def test_a_prefix_of_a_unit_of_gwyddion_is_no_factor(tmp_path, name, xy, z):
+    write_field(tmp_path / name, HEIGHTS * 1e-6, (3e-6, 4e-6), xy, z)
+    field = read_height_field(tmp_path / name)
+    np.testing.assert_allclose(field.heights, HEIGHTS, rtol=1e-6)
+    assert field.pixel_size == pytest.approx((1.0, 2.0))
+    # Tilted by more than a scan can be high.
+    write_field(tmp_path / name, HEIGHTS * 1e-5, (3e-5, 4e-5), xy, z)
+    field = read_height_field(tmp_path / name, keep_missing=True)
+    np.testing.assert_allclose(field.heights, HEIGHTS * 10, rtol=1e-6)
+
+
+@pytest.mark.parametrize("name", ["scan.gwy", "scan.gsf"])
+@pytest.mark.parametrize(("xy", "along"), [("um", 1.0), ("nm", 1e-3), ("m", 1e6)])
+@pytest.mark.parametrize(("z", "high"), [("um", 1.0), ("nm", 1e-3), ("Å", 1e-4)])
+def test_lengths_that_are_possible_only_in_the_prefixed_unit_are_taken_in_it(tmp_path, name, xy, along, z, high):
+    write_field(tmp_path / name, HEIGHTS / high, (3 / along, 4 / along), xy, z)
+    with warnings.catch_warnings(record=True) as caught:
+        warnings.simplefilter("always")
+        field = read_height_field(tmp_path / name)
+    taken = [f"its lengths are taken in {xy}", f"its heights are taken in {z}"][xy == "m" :]
+    for words, warning in zip(taken, caught, strict=True):
+        assert words in str(warning.message)
+    np.testing.assert_allclose(field.heights, HEIGHTS, rtol=1e-6)
+    assert field.pixel_size == pytest.approx((1.0, 2.0))
+    # Units and sizes that are given leave no doubt.
+    assert read_height_field(tmp_path / name, 0.5, unit=("um", z)).height_range == pytest.approx(np.ptp(HEIGHTS))
 
 
 def gwy_object(name, *components):
@@ -486,13 +522,15 @@ def test_a_micro_sign_of_windows_is_read(tmp_path):
     title = component("/0/data/title", "s", "Höhe\0".encode("latin-1"))
     data = component("/0/data", "o", gwy_data(unit, unit, 1.0))
     (tmp_path / "scan.gwy").write_bytes(gwy_bytes(data + title))
-    field = read_height_field(tmp_path / "scan.gwy")
+    with pytest.warns(UserWarning, match="taken in µm"):
+        field = read_height_field(tmp_path / "scan.gwy")
     np.testing.assert_allclose(field.heights, HEIGHTS, rtol=1e-14)
     assert field.pixel_size == pytest.approx((1.0, 2.0))
     assert field.source == "scan.gwy, Höhe"
     header = GSF.replace("e-6", "").replace("= m", "= µm")
     write_gsf(tmp_path / "scan.gsf", header, HEIGHTS, "latin-1")
-    field = read_height_field(tmp_path / "scan.gsf")
+    with pytest.warns(UserWarning, match="taken in µm"):
+        field = read_height_field(tmp_path / "scan.gsf")
     np.testing.assert_allclose(field.heights, HEIGHTS, rtol=1e-6)
     assert field.pixel_size == pytest.approx((1.0, 2.0))
 

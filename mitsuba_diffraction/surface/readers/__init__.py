@@ -18,10 +18,19 @@ from numpy.typing import NDArray
 
 from ...errors import RequestError, is_number
 from ...files.writing import refuse_special
-from ...settings import Settings
 from ..heightfield import HeightField
 from . import gwyddion, images, instruments, interferometers, nanoscope, text, workarounds
-from .scan import Scan, micrometres, pair
+from .scan import (
+    MAX_FIELD,
+    MAX_HEIGHT_RANGE,
+    MAX_PIXEL,
+    MIN_HEIGHT_RANGE,
+    MIN_PIXEL,
+    Scan,
+    is_possible_size,
+    micrometres,
+    pair,
+)
 
 __all__ = ["read_height_field"]
 
@@ -71,9 +80,6 @@ _EXTENSIONS = (*_WITHOUT_UNIT, *_WITH_CHANNELS, *_WITH_UNIT)
 _OF_MANY_PROGRAMS = (".dat", ".asc", ".csv", ".txt", ".xyz")
 _HEADER_BYTES = 4096  # of a text
 
-# What a scan that diffracts light can be, µm; outside, a unit is wrong.
-_MIN_HEIGHT_RANGE, _MAX_HEIGHT_RANGE = 2e-4, Settings.largest_height_range
-_MIN_PIXEL, _MAX_PIXEL, _MAX_FIELD = 1e-4, 100.0, 5e4
 _UNITS = "unit (unit=um,unit=m: lateral lengths in µm, heights in m)"
 _RANGE = "height_range, in µm,"
 
@@ -165,23 +171,25 @@ def read_height_field(
         raise RequestError(f"{path}: {textwrap.shorten(str(error), _MAX_QUOTE, placeholder=' …')}") from error
     if doubt:
         warnings.warn(f"{source}: {doubt}; pixel_size, in µm, sets another scale", stacklevel=2)
+    if scan.doubt_of_heights:
+        warnings.warn(f"{source}: {scan.doubt_of_heights}; {_UNITS} sets another", stacklevel=2)
     return field
 
 
 def _check_scale(field: HeightField, levelled: bool, remedy: str) -> None:
     """Refuse pixels or a size that no scan has, and warn of such heights; one still to be levelled may be tilted."""
     (x, y), size = field.pixel_size, max(field.tile_size)
-    if not (min(x, y) >= _MIN_PIXEL and max(x, y) <= _MAX_PIXEL and size <= _MAX_FIELD):
+    if not is_possible_size(field.pixel_size, field.shape):
         raise RequestError(
-            f"pixel_size: got {x:.4g} × {y:.4g} µm, a field of {size:.4g} µm, wanted pixels of {_MIN_PIXEL:g} to "
-            f"{_MAX_PIXEL:g} µm and at most {_MAX_FIELD:g} µm: is their unit right? pixel_size, in µm, "
+            f"pixel_size: got {x:.4g} × {y:.4g} µm, a field of {size:.4g} µm, wanted pixels of {MIN_PIXEL:g} to "
+            f"{MAX_PIXEL:g} µm and at most {MAX_FIELD:g} µm: is their unit right? pixel_size, in µm, "
             "sets them"
         )
     height_range = float(np.nanmax(field.heights) - np.nanmin(field.heights))
-    if 0 < height_range < _MIN_HEIGHT_RANGE or (levelled and height_range > _MAX_HEIGHT_RANGE):
+    if 0 < height_range < MIN_HEIGHT_RANGE or (levelled and height_range > MAX_HEIGHT_RANGE):
         warnings.warn(
-            f"{field.source}: got heights of a range of {height_range:.3g} µm, wanted {_MIN_HEIGHT_RANGE:g} to "
-            f"{_MAX_HEIGHT_RANGE:g} µm: is their unit right? {remedy} sets another",
+            f"{field.source}: got heights of a range of {height_range:.3g} µm, wanted {MIN_HEIGHT_RANGE:g} to "
+            f"{MAX_HEIGHT_RANGE:g} µm: is their unit right? {remedy} sets another",
             stacklevel=3,
         )
 

@@ -7,6 +7,9 @@ An object of a .gwy file is its name, a zero byte, the number of bytes that foll
 component is its name, a zero byte, a letter for its type, and its value. All numbers are little-endian. Every size is
 checked against the remaining bytes before it is used.
 
+Lengths are in the base unit, metres, even if the text of the unit has a prefix, as in files of Gwyddion 1.x. Other
+programs write lengths in the prefixed unit; it is taken where metres are impossible.
+
 In files of Gwyddion 1.x, which begin with GWYO, a component of a container is the number of its type in GLib (uint32),
 its name, a zero byte, and its value; within other objects it is as above.
 """
@@ -15,7 +18,7 @@ from __future__ import annotations
 
 import re
 import struct
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
@@ -24,7 +27,7 @@ from numpy.typing import NDArray
 
 from ...errors import RequestError
 from . import scan
-from .scan import MAX_ARRAY_BYTES, Channel, Scan, choose_channel
+from .scan import MAX_ARRAY_BYTES, MAX_FIELD, MIN_HEIGHT_RANGE, Channel, Scan, choose_channel, is_possible_size
 
 _NUMBERS = {"b": "<B", "c": "<B", "i": "<i", "q": "<q", "d": "<d"}
 _ARRAYS = {"C": 1, "I": 4, "Q": 8, "D": 8}  # bytes of an element
@@ -59,11 +62,42 @@ def read_gwyddion(path: Path, unit: str | tuple[str, str] | None, channel: str |
     channels = [Channel(n, titles.get(n, "untitled"), scan.is_length(z) or not z) for n, z in sorted(units.items())]
     chosen = choose_channel(channels, channel)
     field = fields[chosen.number]
-    high = scan.scale_of_heights(units[chosen.number], unit)
-    along = scan.scale(_unit(field, "si_unit_xy"), scan.pair(unit)[0], "the width")
     heights, size = _heights(field)
-    rows, columns = heights.shape
-    return Scan(heights * high, (size[0] * along / columns, size[1] * along / rows), chosen.name)
+    return _scan(heights, size, chosen.name, (_unit(field, "si_unit_xy"), units[chosen.number]), unit)
+
+
+def _scan(
+    numbers: NDArray[np.float64],
+    size: tuple[float, float] | None,
+    name: str,
+    own: tuple[str, str],
+    unit: str | tuple[str, str] | None,
+) -> Scan:
+    """Return a field as a scan; its lateral lengths and its heights have the units `own`, or else the given ones."""
+    high = scan.scale_of_heights(own[1], unit)
+    pixel_size, doubt, doubt_of_heights, max_range = None, "", "", MAX_FIELD
+    if size is not None:
+        rows, columns = numbers.shape
+        x, y = size[0] / columns, size[1] / rows
+        along = scan.scale(own[0], scan.pair(unit)[0], "the width")
+        if own[0]:
+            along, doubt = _taken(own[0], "lengths", lambda one: is_possible_size((x * one, y * one), numbers.shape))
+        pixel_size, max_range = (x * along, y * along), max(size) * along
+    if own[1] and not isinstance(unit, tuple | list):
+        finite = numbers[np.isfinite(numbers)]
+        height_range = float(np.ptp(finite)) if finite.size else 0.0
+        high, doubt_of_heights = _taken(
+            own[1], "heights", lambda one: MIN_HEIGHT_RANGE <= height_range * one <= max_range
+        )
+    return Scan(numbers * high, pixel_size, name, doubt, doubt_of_heights=doubt_of_heights)
+
+
+def _taken(unit: str, what: str, is_possible: Callable[[float], bool]) -> tuple[float, str]:
+    """Return the base unit in µm, or the prefixed `unit` with a doubt where only in it the lengths are possible."""
+    base, prefixed = scan.micrometres("m", "unit"), scan.micrometres(unit, "unit")
+    if base == prefixed or is_possible(base) or not is_possible(prefixed):
+        return base, ""
+    return prefixed, f"its {what} are taken in {unit}, as written, since they cannot be in m, which Gwyddion reads"
 
 
 def _heights(field: dict[str, Any]) -> tuple[NDArray[np.float64], tuple[float, float]]:
@@ -165,17 +199,14 @@ def read_simple_field(path: Path, unit: str | tuple[str, str] | None) -> Scan:
         if 4 * rows * columns > MAX_ARRAY_BYTES:
             raise RequestError(f"got {columns} × {rows} pixels, wanted at most {MAX_ARRAY_BYTES} bytes")
         start = end + 4 - end % 4
-        size = path.stat().st_size
-        if size != start + 4 * rows * columns:
-            raise RequestError(f"got {size} bytes, wanted {start + 4 * rows * columns} for {columns} × {rows} pixels")
+        length = path.stat().st_size
+        if length != start + 4 * rows * columns:
+            raise RequestError(f"got {length} bytes, wanted {start + 4 * rows * columns} for {columns} × {rows} pixels")
         file.seek(start)
         numbers = np.frombuffer(file.read(4 * rows * columns), "<f4").reshape(rows, columns)
-    heights = numbers.astype(np.float64) * scan.scale_of_heights(fields.get("ZUnits", ""), unit)
-    pixel_size = None
-    if "XReal" in fields and "YReal" in fields:
-        scale = scan.scale(fields.get("XYUnits", ""), scan.pair(unit)[0], "the width")
-        pixel_size = (_length(fields, "XReal") * scale / columns, _length(fields, "YReal") * scale / rows)
-    return Scan(heights, pixel_size, fields.get("Title", ""))
+    size = (_length(fields, "XReal"), _length(fields, "YReal")) if fields.keys() >= {"XReal", "YReal"} else None
+    own = fields.get("XYUnits", ""), fields.get("ZUnits", "")
+    return _scan(numbers.astype(np.float64), size, fields.get("Title", ""), own, unit)
 
 
 def _fields(header: bytes) -> dict[str, str]:

@@ -9,6 +9,11 @@ from dataclasses import dataclass
 from numpy.typing import NDArray
 
 from ...errors import RequestError
+from ...settings import Settings
+
+# What a scan that diffracts light can be, µm; outside, a unit is wrong.
+MIN_HEIGHT_RANGE, MAX_HEIGHT_RANGE = 2e-4, Settings.largest_height_range
+MIN_PIXEL, MAX_PIXEL, MAX_FIELD = 1e-4, 100.0, 5e4
 
 _MICROMETRES = {
     "m": 1e6,
@@ -37,6 +42,12 @@ def micrometres(unit: str, what: str) -> float:
     if not (isinstance(unit, str) and is_length(unit)):
         raise RequestError(f"{what}: got the unit {unit!r}, wanted a length ({UNITS})")
     return _MICROMETRES[unit.strip()]
+
+
+def is_possible_size(pixel_size: tuple[float, float], shape: tuple[int, int]) -> bool:
+    """Return whether a scan can have these pixels, (x, y) µm, and this size; `shape` is (rows, columns)."""
+    (x, y), (rows, columns) = pixel_size, shape
+    return min(x, y) >= MIN_PIXEL and max(x, y) <= MAX_PIXEL and max(x * columns, y * rows) <= MAX_FIELD
 
 
 def scale(own: str, given: str, what: str) -> float:
@@ -90,6 +101,7 @@ class Scan:
         pixel_size: (x, y) in µm; None if the file has none.
         channel: the name of the channel, in formats with several.
         doubt: how the file contradicts itself about the pixel size, or leaves it in doubt.
+        doubt_of_heights: the same, of the unit of the heights.
         height_range: of the full range of integers, µm; None if the file has none.
     """
 
@@ -98,6 +110,7 @@ class Scan:
     channel: str = ""
     doubt: str = ""
     height_range: float | None = None
+    doubt_of_heights: str = ""
 
 
 @dataclass(frozen=True)
