@@ -130,6 +130,27 @@ def test_a_module_has_its_file_name_for_itself():
         assert name not in found or is_command(module, name), module
 
 
+def changed_arguments(path):
+    """Lines that change an argument by an operator such as `&=`, before the function assigns anything to its name."""
+    for function in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
+        if isinstance(function, ast.FunctionDef):
+            names, nodes = {argument.arg for argument in function.args.args}, list(ast.walk(function))
+            stored = [each for each in nodes if isinstance(each, ast.Name) and isinstance(each.ctx, ast.Store)]
+            changes = {each.target for each in nodes if isinstance(each, ast.AugAssign)}
+            for name in names:
+                first = min((each for each in stored if each.id == name), key=lambda each: each.lineno, default=None)
+                if first in changes:
+                    yield f"{path.name}:{first.lineno}"
+
+
+@pytest.mark.quick
+def test_no_function_changes_an_array_of_its_caller():
+    """An array of Dr.Jit is changed itself by `&=`."""
+    online = [path for path in MODULES.values() if re.search(r"^import (drjit|mitsuba)", path.read_text(), re.M)]
+    assert online
+    assert [line for path in online for line in changed_arguments(path)] == []
+
+
 def in_a_fresh_process(program):
     done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, timeout=120)
     assert done.returncode == 0, done.stderr

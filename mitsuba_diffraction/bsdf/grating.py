@@ -282,7 +282,7 @@ class Grating:
         power, probability = self.theory.evaluate(geometry, incidence, pair, pending != 0)
         square = dr.square(incidence.frequency)
         power *= square * factor
-        value += mi.UnpolarizedSpectrum([dr.select(c, power, 0) for c in chosen])
+        value = value + mi.UnpolarizedSpectrum([dr.select(c, power, 0) for c in chosen])
         probability *= dr.square(geometry.outgoing.index)
         return pending - first_bit, value, dr.fma(probability, square, density)
 
@@ -304,13 +304,13 @@ class Grating:
         if interface.transmits and not interface.is_sheet and ctx.mode == mi.TransportMode.Radiance:
             # Radiance scales with n².
             vectors = [[of_channel.wave_vector(omega) for omega in directions] for of_channel in at]
-            value *= mi.UnpolarizedSpectrum([dr.square(k_i.index / k_o.index) for k_i, k_o in vectors])
+            value = value * mi.UnpolarizedSpectrum([dr.square(k_i.index / k_o.index) for k_i, k_o in vectors])
         if not mi.is_polarized:
             for omega in directions:
                 if self.coat is not None:
-                    value *= 1 - self.coat.reflectance(si, omega.z)
+                    value = value * (1 - self.coat.reflectance(si, omega.z))
                 elif interface.has_flat_face:
-                    value *= mi.UnpolarizedSpectrum([i.flat_face_transmittance(omega) for i in at])
+                    value = value * mi.UnpolarizedSpectrum([i.flat_face_transmittance(omega) for i in at])
             return value
         split = self.theory.split(value, si, self.frame(si, active), active)
         if self.coat is None and not interface.has_flat_face:

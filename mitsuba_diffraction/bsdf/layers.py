@@ -142,7 +142,7 @@ class Layers:
         cos = mi.Frame3f.cos_theta(si.wi)
         if self.interface.transmits:
             return mi.UnpolarizedSpectrum(1.0)
-        active &= cos > 0
+        active = active & (cos > 0)
         reflected = self.grating.reflectance(si, cos, active)
         if self.coat is not None:
             front = self.coat.reflectance(si, cos)

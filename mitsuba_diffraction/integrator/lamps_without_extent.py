@@ -32,13 +32,15 @@ class LampsWithoutExtent:
     """The lamps without extent of a scene.
 
     Attributes:
-        any: whether there are any.
+        any: whether the scene draws any.
     """
 
     def __init__(self, scene: mi.Scene, sensor: mi.Sensor) -> None:
-        is_lamp = np.array([bool(emitter.flags() & +mi.EmitterFlags.Delta) for emitter in scene.emitters()])
-        self.sensor, self.any = sensor, bool(is_lamp.any())
+        flags = np.array([emitter.flags() for emitter in scene.emitters()])
+        # Light samples do not find a surface that emits in one direction, `directionalarea`.
+        is_lamp = (flags & +mi.EmitterFlags.Delta > 0) & (flags & +mi.EmitterFlags.Surface == 0)
         self._lamps, self._others = Emitters(scene, is_lamp), Emitters(scene, ~is_lamp)
+        self.sensor, self.any = sensor, self._lamps.any
 
     @dr.syntax
     def light(
@@ -49,18 +51,19 @@ class LampsWithoutExtent:
         point, shift, number = sampler.next_2d(active), sampler.next_1d(active), sampler.next_1d(active)
         ds, _ = scene.sample_emitter_direction(si, self._lamps.of(point, active), True, active)
         wo = si.to_local(ds.d)
-        active &= ds.delta & (ds.pdf > 0)
+        reached = active & ds.delta & (ds.pdf > 0)
         wavelengths = [mi.Spectrum(0) for _ in range(_PACKETS)]
         values = [mi.Spectrum(0) for _ in range(_PACKETS)]
         packet = mi.UInt32(0)
-        while active & (packet < _PACKETS):
+        while reached & (packet < _PACKETS):
             # Four wavelengths, each from a quarter of the distribution.
             drawn, weight = self.sensor.sample_wavelengths(nowhere, (mi.Float(packet) + shift) / (4 * _PACKETS))
             other = mi.SurfaceInteraction3f(si)
             other.wavelengths = drawn
-            value = bsdf.eval(ctx, other, wo, active)
-            lit = active & dr.any(value != 0)
-            value *= weight * scene.eval_emitter_direction(other, ds, lit)
+            value = bsdf.eval(ctx, other, wo, reached)
+            lit = reached & dr.any(value != 0)
+            # Not `eval_direction`, which `directionalarea` lacks, and for which a projector lights all around.
+            value *= weight * ds.emitter.sample_direction(other, point, lit)[1]
             for k in range(_PACKETS):
                 wavelengths[k] = mi.Spectrum(dr.select(packet == k, drawn, wavelengths[k]))
                 values[k] = mi.Spectrum(dr.select(lit & (packet == k), value, values[k]))
@@ -69,7 +72,7 @@ class LampsWithoutExtent:
         kept, value = resampled(in_order, number)
         # The scene draws one of all emitters.
         probability = ds.pdf / self._lamps.probability
-        return kept, dr.select(active, value / (_PACKETS * probability), 0)
+        return kept, dr.select(reached, value / (_PACKETS * probability), 0)
 
     def others(self, point: mi.Point2f, active: mi.Bool) -> tuple[mi.Point2f, mi.Float, mi.Bool]:
         """Return numbers for which the scene draws another emitter, its probability to do so, and if there is one."""
@@ -86,18 +89,18 @@ class Emitters:
         chosen: which ones, of all.
 
     Attributes:
-        any: whether there are any.
+        any: whether the scene draws any of them: not those whose `sampling_weight` is zero.
         probability: that the scene draws one of them.
     """
 
     def __init__(self, scene: mi.Scene, chosen: NDArray[np.bool_]) -> None:
-        self.any = bool(chosen.any())
-        if not self.any:
-            return
         count = chosen.size
         # A single number where all are equal.
         all_of_them = np.full(count, scene.pdf_emitter(dr.arange(mi.UInt32, count)), np.float64)
         probabilities = all_of_them[chosen]
+        self.any = bool(probabilities.any())
+        if not self.any:
+            return
         self.probability = opaque(probabilities.sum())
         self._choice = mi.DiscreteDistribution(probabilities.astype(np.float32))
         self._first = mi.Float((np.cumsum(all_of_them) - all_of_them)[chosen].astype(np.float32))

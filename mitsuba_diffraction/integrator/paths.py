@@ -186,7 +186,7 @@ def define_eye_paths() -> type:
             ray, ray_wavelengths = mi.Ray3f(ray), mi.Spectrum(ray.wavelengths)
             throughput, eta = mi.Spectrum(1.0), mi.Float(1.0)
             depth = mi.UInt32(1)
-            active &= si.is_valid() & (depth < self.max_depth)
+            active = active & si.is_valid() & (depth < self.max_depth)
             if dr.hint(draws_wavelengths, mode="scalar"):
                 first_on_grating = self.gratings.contains(si, active)
                 of_lamps = self.lamps.light(scene, sampler, si, first_on_grating)
