@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 from PIL import Image, ImageOps
 
 from ..errors import RequestError
-from .writing import refuse_special
+from .reading import check_file
 
 
 def read_picture(path: Path, invert: bool = False) -> NDArray[np.float64]:
@@ -21,7 +21,7 @@ def read_picture(path: Path, invert: bool = False) -> NDArray[np.float64]:
         FileNotFoundError: if there is no such file.
         ValueError: if it is not an opaque picture.
     """
-    refuse_special(path)
+    check_file(path)
     try:
         with Image.open(path) as opened:
             image = ImageOps.exif_transpose(opened)

@@ -206,14 +206,6 @@ def cache_folder() -> Path:
     return Path(named) if named else platformdirs.user_cache_path("mitsuba_diffraction")
 
 
-def refuse_special(path: str | os.PathLike[str]) -> None:
-    """Raise if `path` does not exist, or is a pipe or a device, which may be endless."""
-    if not os.path.exists(path):
-        raise FileNotFoundError(f"{os.fspath(path)}: no such file")
-    if not (os.path.isfile(path) or os.path.isdir(path)):
-        raise RequestError(f"{os.fspath(path)}: a pipe or a device, wanted an ordinary file")
-
-
 # --- a digest inside the file itself ---
 
 _BEFORE_DIGEST = "SHA-256 of this file with zeros for it: "

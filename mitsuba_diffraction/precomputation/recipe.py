@@ -49,7 +49,8 @@ from pathlib import Path
 from typing import Any
 
 from ..errors import RequestError, check_whole, did_you_mean
-from ..files.writing import cache_folder, examples_folder, refuse_special
+from ..files.reading import check_file, read_bytes
+from ..files.writing import cache_folder, examples_folder
 from ..optics.media import index_files
 from ..progress import Progress, no_progress, part, silent, stage
 from ..settings import SPECTRUM_PARAMETERS, ScalarSettings, Settings
@@ -69,6 +70,7 @@ SCAN_KEYS = ("pixel_size", "height_range", "fill_missing", "channel", "unit", "p
 FLAGS = ("fill_missing", "polarised")  # true or false
 REQUESTED = "representation", "terms", "heights_from", "tolerance"  # of a spectrum; they may override a recipe's
 _OF_PROFILE = "coherence_length", "largest_height_range", *REQUESTED
+MAX_RECIPE_BYTES = 2**14  # one of a kilobyte is long; the time and memory of a TOML parser are quadratic in a key
 MAX_PATCHES = 1000  # of which the mean has three per cent of the speckle of one patch
 # Incremented when the same input gives a different result, to invalidate the cache.
 _BUILD_VERSION = 10
@@ -209,7 +211,7 @@ class Recipe:
             ValueError: if it is not TOML, or not a recipe.
         """
         path = Path(path)
-        refuse_special(path)
+        check_file(path, MAX_RECIPE_BYTES)
         try:
             # Windows' Notepad begins a file with a mark of its byte order.
             content = tomllib.loads(path.read_text(encoding="utf-8-sig"))
@@ -322,8 +324,7 @@ class Recipe:
             parameters = inspect.signature(PROFILES[surface["profile"]]).parameters.items()
             surface = {name: p.default for name, p in parameters if p.default is not p.empty} | surface
         for scan in self.files:
-            refuse_special(scan)
-            content.update(scan.read_bytes())
+            content.update(read_bytes(scan))
             content.update(scan.suffix.lower().encode())
         settings = self.settings.chosen
         settings |= {name: file.name for name, file in index_files(settings).items()}

@@ -10,7 +10,8 @@ import pytest
 from foreign_scans import COLUMNS, DX, DY, REVISION, ROWS, ibw, jpk, nms, park, sur, tmd, wyko, x3p, zygo
 from test_instrument_files import needs_the_extra
 
-from mitsuba_diffraction.surface.readers import read_height_field, workarounds
+from mitsuba_diffraction.files import reading
+from mitsuba_diffraction.surface.readers import read_height_field
 
 MISSING = [(7, 11), (7, 12)]
 INSTRUMENTS = {
@@ -332,10 +333,11 @@ def test_a_jpk_image_of_a_part_of_the_grid_has_its_pixels(tmp_path):
 @needs_the_extra
 def test_curves_of_jpk_are_not_unpacked(tmp_path, monkeypatch):
     (tmp_path / "scan.jpk-qi-data").write_bytes(jpk(image="data-image.jpk-qi-image", curves=300_000))
-    monkeypatch.setattr(workarounds, "MAX_ARRAY_BYTES", 100_000)
+    monkeypatch.setattr(reading, "MAX_SMALL_ARRAY_BYTES", 100_000)
+    monkeypatch.setattr(reading, "MAX_EXPANSION", 0.1)
     check(tmp_path / "scan.jpk-qi-data")
-    monkeypatch.setattr(workarounds, "MAX_ARRAY_BYTES", 1000)
-    with pytest.raises(ValueError, match=r"got an image of .* wanted at most 1000"):
+    monkeypatch.setattr(reading, "MAX_SMALL_ARRAY_BYTES", 1000)
+    with pytest.raises(ValueError, match=r"got an archive of .* wanted at most 1.0 kB"):
         read_height_field(tmp_path / "scan.jpk-qi-data")
     (tmp_path / "scan.jpk-qi-data").write_bytes(jpk(image="data-image.other"))
     (tmp_path / "scan.jpk-force").write_bytes(jpk(image="data-image.other"))

@@ -11,6 +11,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
+from mitsuba_diffraction.files import reading
 from mitsuba_diffraction.surface import prepare
 from mitsuba_diffraction.surface.heightfield import HeightField
 from mitsuba_diffraction.surface.periods import find_periods
@@ -202,8 +203,8 @@ def test_an_archive_that_unpacks_to_too_much_is_refused(tmp_path, monkeypatch):
 
     with zipfile.ZipFile(tmp_path / "scan.x3p", "w", zipfile.ZIP_DEFLATED) as archive:
         archive.writestr("main.xml", bytes(100_000))
-    monkeypatch.setattr(instruments, "MAX_ARRAY_BYTES", 1000)
-    with pytest.raises(ValueError, match="an archive of 100000 bytes, wanted at most 1000"):
+    monkeypatch.setattr(reading, "MAX_SMALL_ARRAY_BYTES", 1000)
+    with pytest.raises(ValueError, match=r"an archive of .* that unpacks to 100 kB, wanted at most"):
         read_height_field(tmp_path / "scan.x3p")
 
 

@@ -12,6 +12,7 @@ from hypothesis import strategies as st
 from hypothesis.extra import numpy as npst
 from PIL import Image
 
+from mitsuba_diffraction.files import reading
 from mitsuba_diffraction.surface.readers import gwyddion, read_height_field
 
 HEIGHTS = np.array([[0.0, 0.1, 0.25], [0.3, 0.2, 0.05]])
@@ -342,8 +343,8 @@ def test_a_header_that_claims_too_many_pixels_is_refused(tmp_path, refuse, side)
 
 def test_an_archive_that_unpacks_to_too_much_is_refused(tmp_path, refuse, monkeypatch):
     np.savez_compressed(tmp_path / "scan.npz", heights=np.zeros((100, 100)))
-    monkeypatch.setattr("mitsuba_diffraction.surface.readers.images.MAX_ARRAY_BYTES", 1000)
-    refuse("scan.npz", "wanted at most 1000")
+    monkeypatch.setattr(reading, "MAX_SMALL_ARRAY_BYTES", 1000)
+    refuse("scan.npz", "got 100 × 100 numbers in 0.. kB, wanted at most")
 
 
 def test_coloured_annotation_on_a_grey_picture_is_missing(tmp_path, refuse):
@@ -686,7 +687,7 @@ def test_gsf_without_a_scale_is_refused(tmp_path, refuse):
     [
         ("1.0", "2.0", "not a Gwyddion Simple Field"),
         ("XRes = 3", "XRes = 4", "bytes, wanted"),
-        ("XRes = 3", "XRes = 999999999", "wanted at most"),
+        ("XRes = 3", "XRes = 999999999", "wanted 8000000104"),
         ("XRes = 3", "XRes = -3", "XRes: got -3"),
         ("XRes = 3\n", "", "XRes: got none"),
         ("XReal = 3e-6", "XReal = wide", "XReal: got wide"),

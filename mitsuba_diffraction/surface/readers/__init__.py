@@ -17,7 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ...errors import RequestError, is_number
-from ...files.writing import refuse_special
+from ...files.reading import check_file
 from ..heightfield import HeightField
 from . import gwyddion, images, instruments, interferometers, nanoscope, text, workarounds
 from .scan import (
@@ -139,7 +139,7 @@ def read_height_field(
             pixel size.
     """
     path = Path(path)
-    refuse_special(path)
+    check_file(path)
     hint = f"; on the command line: {path.name},pixel_size=…"
     try:
         # Numbers that overflow become infinite, and are refused as missing pixels or invalid lengths.

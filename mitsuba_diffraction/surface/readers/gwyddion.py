@@ -26,8 +26,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ...errors import RequestError
+from ...files.reading import read_bytes
 from . import scan
-from .scan import MAX_ARRAY_BYTES, MAX_FIELD, MIN_HEIGHT_RANGE, Channel, Scan, choose_channel, is_possible_size
+from .scan import MAX_FIELD, MIN_HEIGHT_RANGE, Channel, Scan, choose_channel, is_possible_size
 
 _NUMBERS = {"b": "<B", "c": "<B", "i": "<i", "q": "<q", "d": "<d"}
 _ARRAYS = {"C": 1, "I": 4, "Q": 8, "D": 8}  # bytes of an element
@@ -41,9 +42,7 @@ _MAX_HEADER_LENGTH = 2**20
 
 def read_gwyddion(path: Path, unit: str | tuple[str, str] | None, channel: str | int | None) -> Scan:
     """Read one data field of a .gwy file; the top row of its image is row 0. Masks are ignored."""
-    if path.stat().st_size > MAX_ARRAY_BYTES:
-        raise RequestError(f"got {path.stat().st_size} bytes, wanted at most {MAX_ARRAY_BYTES}")
-    data = path.read_bytes()
+    data = read_bytes(path)
     if data[:4] == b"GWYQ":
         raise RequestError("a Gwyddion file with sizes of 64 bits ('GWYQ'): save it as .gwy of Gwyddion 2, or as .gsf")
     if data[:4] not in (b"GWYP", b"GWYO"):
@@ -196,8 +195,6 @@ def read_simple_field(path: Path, unit: str | tuple[str, str] | None) -> Scan:
             raise RequestError("the header does not end: a truncated file")
         fields = _fields(head[len(_SIMPLE) : end])
         columns, rows = (_count(fields, name) for name in ("XRes", "YRes"))
-        if 4 * rows * columns > MAX_ARRAY_BYTES:
-            raise RequestError(f"got {columns} × {rows} pixels, wanted at most {MAX_ARRAY_BYTES} bytes")
         start = end + 4 - end % 4
         length = path.stat().st_size
         if length != start + 4 * rows * columns:

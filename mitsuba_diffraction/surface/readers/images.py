@@ -2,11 +2,11 @@
 
 from __future__ import annotations
 
+import math
 import re
 import tokenize
 import warnings
 import zipfile
-import zlib
 from collections.abc import Iterable
 from contextlib import suppress
 from pathlib import Path
@@ -18,34 +18,31 @@ from PIL import Image, UnidentifiedImageError
 
 from ...errors import RequestError
 from ...files.outputs import MARK
-from .scan import DAMAGED, MAX_ARRAY_BYTES, Scan
+from ...files.reading import BAD_ARCHIVE, check_array
+from .scan import DAMAGED, Scan
 
 
 def read_npy(path: Path) -> Scan:
     """Read the array of a file."""
+    stored = path.stat().st_size
     with path.open("rb") as file:
-        return Scan(_load_array(file))
+        return Scan(_load_array(file, stored, stored))
 
 
 def read_npz(path: Path) -> Scan:
     """Read the array `heights` of an archive, and its `pixel_size`, if any."""
     try:
         with zipfile.ZipFile(path) as archive:
-            unpacked = max((member.file_size for member in archive.infolist()), default=0)
-            if unpacked > MAX_ARRAY_BYTES:
-                raise RequestError(f"got an array of {unpacked} bytes, wanted at most {MAX_ARRAY_BYTES}")
             names = [name.removesuffix(".npy") for name in archive.namelist()]
             if "heights" not in names:
                 raise RequestError(f"got the arrays {names}, wanted 'heights' and optionally 'pixel_size'")
-            with archive.open("heights.npy") as file:
-                heights = _load_array(file)
+            heights = _load_member(archive, "heights.npy", path)
             if "pixel_size" not in names:
                 return Scan(heights)
-            with archive.open("pixel_size.npy") as file:
-                pixel_size = _load_array(file)
+            pixel_size = _load_member(archive, "pixel_size.npy", path)
     except RequestError:
         raise
-    except (zipfile.BadZipFile, EOFError, KeyError, NotImplementedError, RuntimeError, ValueError, zlib.error) as error:
+    except BAD_ARCHIVE as error:
         raise RequestError(f"not a whole .npz archive ({error})") from None
     if pixel_size.dtype.kind not in "iuf" or pixel_size.shape not in ((), (1,), (2,)):
         raise RequestError(
@@ -56,12 +53,27 @@ def read_npz(path: Path) -> Scan:
     return Scan(heights, (float(x), float(y)))
 
 
-def _load_array(file: IO[bytes]) -> NDArray:
-    """Read an array in NumPy's format; pickles are refused."""
+def _load_member(archive: zipfile.ZipFile, name: str, path: Path) -> NDArray:
+    """Read an array of an archive."""
+    with archive.open(name) as file:
+        return _load_array(file, archive.getinfo(name).file_size, path.stat().st_size)
+
+
+def _load_array(file: IO[bytes], size: int, stored: int) -> NDArray:
+    """Read an array of `size` bytes in NumPy's format, from a file of `stored` bytes; pickles are refused."""
     try:
         with warnings.catch_warnings():
             warnings.simplefilter("error", UserWarning)
+            version = np.lib.format.read_magic(file)
+            header = np.lib.format.read_array_header_1_0 if version == (1, 0) else np.lib.format.read_array_header_2_0
+            shape, _, dtype = header(file)
+            check_array(shape, stored)
+            if dtype.itemsize * math.prod(shape) > size:
+                raise RequestError(f"got {size} bytes, wanted {' × '.join(map(str, shape))} numbers: truncated")
+            file.seek(0)
             return np.lib.format.read_array(file, allow_pickle=False)
+    except RequestError:
+        raise
     except (*DAMAGED, ValueError, MemoryError, tokenize.TokenError) as error:
         raise RequestError(f"not an array that can be read ({error})") from None
 
@@ -90,6 +102,7 @@ def read_image(path: Path) -> Scan:
                 pages = getattr(picture, "n_frames", 1)
                 if pages != 1:
                     raise RequestError(f"got {pages} pages or frames, wanted one")
+                check_array(picture.size, path.stat().st_size)
                 pixel_size, height_range = _own_scale(picture)
                 return Scan(_numbers_of(picture), pixel_size, height_range=height_range)
         except UnidentifiedImageError:

@@ -17,8 +17,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ...errors import RequestError, pip_install
+from ...files.reading import BAD_ARCHIVE, check_array, check_unpacked
 from . import scan, workarounds
-from .scan import MAX_ARRAY_BYTES, Channel, Scan, choose_channel
+from .scan import Channel, Scan, choose_channel
 
 EXTRA = pip_install("instruments")
 
@@ -72,8 +73,7 @@ def read_instrument(path: Path, unit: str | tuple[str, str] | None, channel: str
                 channel,
             )
             source = found[chosen.number]
-            if 8 * int(np.prod(source.nb_grid_pts, dtype=object)) > MAX_ARRAY_BYTES:
-                raise RequestError(f"got {source.nb_grid_pts} pixels, wanted at most {MAX_ARRAY_BYTES} bytes")
+            check_array([int(n) for n in source.nb_grid_pts], path.stat().st_size)
             given, own = scan.pair(unit), source.unit or ""
             along = scan.scale(own, given[0], "its lengths")
             high = scan.scale_of_heights(own if has_unit_of_heights else "", unit)
@@ -123,7 +123,6 @@ def _refuse_bomb(path: Path) -> None:
         try:
             with zipfile.ZipFile(path) as archive:
                 unpacked = sum(member.file_size for member in archive.infolist())
-        except (zipfile.BadZipFile, ValueError, NotImplementedError) as error:
+        except BAD_ARCHIVE as error:
             raise RequestError(f"a damaged archive ({error})") from None
-        if unpacked > MAX_ARRAY_BYTES:
-            raise RequestError(f"an archive of {unpacked} bytes, wanted at most {MAX_ARRAY_BYTES}")
+        check_unpacked(unpacked, path.stat().st_size)

@@ -85,7 +85,6 @@ def decoded(content: bytes) -> str:
         return content.decode("latin-1")
 
 
-MAX_ARRAY_BYTES = 2**31  # of an array read from a file
 # Raised by Pillow and NumPy for damaged files, in addition to OSError and ValueError.
 DAMAGED = (SyntaxError, TypeError, KeyError, EOFError, IndexError, OverflowError, struct.error, UserWarning)
 # Names of the height channel in instrument files.

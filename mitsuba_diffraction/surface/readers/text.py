@@ -45,8 +45,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ...errors import RequestError
+from ...files.reading import read_bytes
 from . import scan
-from .scan import MAX_ARRAY_BYTES, Scan
+from .scan import Scan
 
 _MAX_GRID_DEVIATION = 0.1  # of a coordinate, in pixels, owing to rounding in text
 _MIN_POINT_FRACTION = 0.25  # of grid positions that have a point
@@ -229,9 +230,7 @@ def _esri(text: str, unit: str | tuple[str, str] | None) -> Scan:
 
 def contents(path: Path) -> str:
     """Return a text in UTF-8 or Latin-1, whose lines end with \\n."""
-    if path.stat().st_size > MAX_ARRAY_BYTES:
-        raise RequestError(f"got {path.stat().st_size} bytes, wanted at most {MAX_ARRAY_BYTES}")
-    text = scan.decoded(path.read_bytes()).replace("\r\n", "\n").replace("\r", "\n")
+    text = scan.decoded(read_bytes(path)).replace("\r\n", "\n").replace("\r", "\n")
     if "\0" in text:
         raise RequestError("not a text: it holds zero bytes")
     return text

@@ -33,8 +33,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ...errors import RequestError
+from ...files.reading import BAD_ARCHIVE, check_unpacked, parse_xml, read_bytes
 from . import nanoscope, scan
-from .scan import MAX_ARRAY_BYTES
 
 _TMD_COMMENT = 24  # bytes, of the only comment that the library reads
 _SUR_HEADER, _SUR_SIZES = 512, struct.Struct("<2h")  # lengths of comment and private data, at `_SUR_AT`
@@ -72,9 +72,7 @@ def rewritten(path: Path, name: str) -> Rewritten:
         return Rewritten(io.BytesIO(_jpk_image(path)))
     if name not in (*_REWRITE, "di"):
         return Rewritten(str(path))
-    if path.stat().st_size > MAX_ARRAY_BYTES:
-        raise RequestError(f"got {path.stat().st_size} bytes, wanted at most {MAX_ARRAY_BYTES}")
-    data = path.read_bytes()
+    data = read_bytes(path)
     if name == "di":
         data, doubts = nanoscope.rewritten_nanoscope(data)
         return Rewritten(io.BytesIO(data), doubts)
@@ -84,7 +82,7 @@ def rewritten(path: Path, name: str) -> Rewritten:
 
 def is_jpk(path: Path) -> bool:
     """Return whether a file is an archive of force curves of JPK."""
-    with suppress(zipfile.BadZipFile, NotImplementedError, ValueError), zipfile.ZipFile(path) as archive:
+    with suppress(*BAD_ARCHIVE), zipfile.ZipFile(path) as archive:
         return "header.properties" in archive.namelist()
     return False
 
@@ -98,10 +96,11 @@ def _jpk_image(path: Path) -> bytes:
                     f"an archive without an image of the heights ({' or '.join(_JPK_IMAGES)}): save that image with "
                     "JPK's program, as .jpk or .jpk-qi-image"
                 )
-            if image.file_size > MAX_ARRAY_BYTES:
-                raise RequestError(f"got an image of {image.file_size} bytes, wanted at most {MAX_ARRAY_BYTES}")
+            check_unpacked(image.file_size, path.stat().st_size)
             return archive.read(image)
-    except (zipfile.BadZipFile, NotImplementedError, RuntimeError, EOFError, zlib.error) as error:
+    except RequestError:
+        raise
+    except BAD_ARCHIVE as error:
         raise RequestError(f"a damaged archive ({error})") from None
 
 
@@ -122,8 +121,7 @@ def _sur(data: bytes) -> bytes:
         (count,) = struct.unpack_from("<I", data, start)
         sizes = struct.unpack_from(f"<{2 * count}I", data, start + 4)
         begin, streams = start + 4 + 8 * count, []
-        if sum(sizes[::2]) > MAX_ARRAY_BYTES:
-            raise RequestError(f"got {sum(sizes[::2])} bytes of heights, wanted at most {MAX_ARRAY_BYTES}")
+        check_unpacked(sum(sizes[::2]), len(data))
         for raw, packed in zip(sizes[::2], sizes[1::2], strict=True):
             streams.append(zlib.decompressobj().decompress(data[begin : begin + packed], raw))
             begin += packed
@@ -161,8 +159,10 @@ def _x3p(data: bytes) -> bytes:
         if not mains:
             raise RequestError("not an X3P file, which is an archive that contains main.xml")
         main = min(mains, key=len)
-        root = ElementTree.fromstring(archive.read(main))
-    except (zipfile.BadZipFile, ElementTree.ParseError, NotImplementedError, zlib.error) as error:
+        root = parse_xml(archive.read(main))
+    except RequestError:
+        raise
+    except (*BAD_ARCHIVE, ElementTree.ParseError) as error:
         raise RequestError(f"not an X3P file, which is an archive that contains main.xml ({error})") from None
     for element in root.iter():
         element.tag = element.tag.rpartition("}")[2]

@@ -1,0 +1,129 @@
+"""Limits of what is read: files may come from strangers, and are checked before a parser or a library sees them.
+
+The aim is that a file of less than 10 MB is read or refused within 10 s and 1 GB of memory, whatever it declares.
+"""
+
+from __future__ import annotations
+
+import lzma
+import math
+import os
+import zipfile
+import zlib
+from collections.abc import Sequence
+from pathlib import Path
+from xml.etree import ElementTree
+
+from ..errors import RequestError
+from ..progress import bytes_text
+
+MAX_FILE_BYTES = 2**31
+MAX_SMALL_ARRAY_BYTES = 2**27  # in float64, of an array from a file of any size: 4096 × 4096 numbers
+MAX_EXPANSION = 24  # of a file into float64; by 8 if it holds numbers of 8 bits without compression
+
+# What zipfile raises of a damaged archive, and where a member is encrypted or compressed in an unknown way.
+BAD_ARCHIVE = (
+    zipfile.BadZipFile,
+    zlib.error,
+    lzma.LZMAError,
+    EOFError,
+    LookupError,
+    NotImplementedError,
+    OSError,
+    RuntimeError,
+    ValueError,
+)
+MAX_ELEMENTS = 2**20  # of an XML file
+MAX_NESTING = 32  # of nested elements
+
+
+def check_file(path: str | os.PathLike[str], max_bytes: int = MAX_FILE_BYTES) -> None:
+    """Raise unless a path is an ordinary file of at most `max_bytes`, or a folder, which fails when it is opened.
+
+    Raises:
+        FileNotFoundError: if it does not exist.
+        RequestError: if it is too large, or a pipe or a device, which may be endless.
+    """
+    name = os.fspath(path)
+    if "\0" in name:
+        raise RequestError(f"got the file name {name!r}, wanted one without zero characters")
+    if not os.path.exists(name):
+        raise FileNotFoundError(f"{name}: no such file")
+    if os.path.isdir(name):
+        return
+    if not os.path.isfile(name):
+        raise RequestError(f"{name}: a pipe or a device, wanted an ordinary file")
+    if (size := os.path.getsize(name)) > max_bytes:
+        raise RequestError(f"{name}: got a file of {bytes_text(size)}, wanted at most {bytes_text(max_bytes)}")
+
+
+def read_bytes(path: str | os.PathLike[str], max_bytes: int = MAX_FILE_BYTES) -> bytes:
+    """Return the content of a file; for errors see `check_file`."""
+    check_file(path, max_bytes)
+    return Path(path).read_bytes()
+
+
+def check_array(shape: Sequence[int], stored: int) -> None:
+    """Check the shape that a file declares before its array is allocated.
+
+    Args:
+        shape: numbers along each axis.
+        stored: bytes of the file.
+
+    Raises:
+        RequestError: if one is negative, or float64 would hold more than `MAX_EXPANSION` times the file, and more than
+            `MAX_SMALL_ARRAY_BYTES`.
+    """
+    count = math.prod(shape)
+    limit = min(max(MAX_SMALL_ARRAY_BYTES, MAX_EXPANSION * stored), MAX_FILE_BYTES) // 8
+    if count > limit or min(shape, default=0) < 0:
+        got = " × ".join(map(str, shape))
+        raise RequestError(
+            f"got {got} numbers in {bytes_text(stored)}, wanted at most {limit}: crop it, or store it without "
+            "compression"
+        )
+
+
+def check_unpacked(unpacked: int, stored: int) -> None:
+    """Check the bytes of the unpacked members of an archive of `stored` bytes before they are unpacked.
+
+    Raises:
+        RequestError: as `check_array`.
+    """
+    limit = min(max(MAX_SMALL_ARRAY_BYTES, MAX_EXPANSION * stored), MAX_FILE_BYTES)
+    if unpacked > limit:
+        raise RequestError(
+            f"got an archive of {bytes_text(stored)} that unpacks to {bytes_text(unpacked)}, wanted at most "
+            f"{bytes_text(limit)}"
+        )
+
+
+class _Bounded(ElementTree.TreeBuilder):
+    """Builds a tree of few levels and without definitions of its own, by which a short text may expand without end."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self._count, self._depth = 0, 0
+
+    def start(self, tag: str, attributes: dict[str, str]) -> ElementTree.Element:
+        self._count, self._depth = self._count + 1, self._depth + 1
+        if self._count > MAX_ELEMENTS or self._depth > MAX_NESTING:
+            raise RequestError(f"got XML of more than {MAX_ELEMENTS} elements or {MAX_NESTING} levels")
+        return super().start(tag, attributes)
+
+    def end(self, tag: str) -> ElementTree.Element:
+        self._depth -= 1
+        return super().end(tag)
+
+    def doctype(self, name: str, public: str | None, system: str | None) -> None:
+        raise RequestError(f"got XML with a document type, {name[:60]!r}, wanted none")
+
+
+def parse_xml(content: bytes) -> ElementTree.Element:
+    """Return the root of an XML file.
+
+    Raises:
+        RequestError: if it has too many elements or levels, or a document type.
+        ElementTree.ParseError: if it is not XML.
+    """
+    return ElementTree.fromstring(content, ElementTree.XMLParser(target=_Bounded()))
