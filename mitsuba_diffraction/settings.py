@@ -19,7 +19,7 @@ from .errors import RequestError, check_whole, is_number
 MIN_WAVELENGTH = 50.0  # nm, of a spectrum
 VISIBLE = (360.0, 830.0)  # nm: the range of the CIE 1931 observer, from which Mitsuba draws wavelengths
 
-FROM_RADIUS = {"radial": 0.0, "tangential": 90.0}  # degrees from the radius in UV space to the pattern's x axis
+FROM_RADIUS = {"radial": 0.0, "tangential": 90.0}  # degrees from the radius to the pattern's x axis
 SUN_COHERENCE_LENGTH = 65.0  # µm, for the angular diameter of 0.53°
 # 1 nm to 1 m; outside, lobes under- or overflow in floating point.
 MIN_COHERENCE_LENGTH, MAX_COHERENCE_LENGTH = 1e-3, 1e6

@@ -104,9 +104,9 @@ PARAMETERS = (
     Parameter(
         "orientation",
         "float, texture or string",
-        "angle from the tangent dp/du to the pattern's x axis, degrees; `radial`: x points away from the centre (0.5, "
-        "0.5) of UV space; `tangential`: x runs around it; or the file of a picture, of integers from 0° (black) to "
-        "360° (white)",
+        "angle from the tangent dp/du to the pattern's x axis, degrees; `radial`: x points away from the centre, on "
+        "meshes (0.5, 0.5) of UV space; `tangential`: x runs around it; or the file of a picture, of integers from 0° "
+        "(black) to 360° (white)",
         "0",
     ),
     Parameter("height_scale", "float, texture or string", "scales the heights; a string is the file of a picture", "1"),

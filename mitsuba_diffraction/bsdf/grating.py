@@ -24,6 +24,7 @@ from .varying import check_texture
 # directions are grazing, K G grows so fast that samples in proportion to the cosine would have large weights.
 UNIFORM_PROBABILITY = 0.02
 _per_cent = functools.partial(progress_bar, unit="%")
+_ROUND = "Sphere", "Cylinder", "BSplineCurve"  # shape types, which are bits
 _Pair = tuple[Geometry, Incidence, tuple[Coordinates, Coordinates] | None]
 """Two directions, the incident light, the coordinates of both in the table of E."""
 
@@ -123,8 +124,7 @@ class Grating:
         sin, cos = dr.sincos(dr.deg2rad(self.orientation.eval_1(si, active)))
         if not self.from_radius:
             return sin, cos
-        # The image of the radius in UV space, whatever the scale, shear or reflection of the UVs.
-        u, v = si.uv - 0.5
+        u, v = _radius_in_uv(si)
         radius = si.to_local(u * si.dp_du + v * si.dp_dv)
         square = dr.square(radius.x) + dr.square(radius.y)
         has_direction = square > 0
@@ -401,6 +401,19 @@ class Grating:
             str(self.theory),
         ]
         return "\n".join(lines)
+
+
+def _radius_in_uv(si: mi.SurfaceInteraction3f) -> tuple[mi.Float, mi.Float]:
+    """Return the direction in UV space that points away from its centre, or across circles about the shape's axis.
+
+    Its image on the surface is the radius, whatever the scale, shear or reflection of the UVs of a mesh. Those of
+    Mitsuba's disk are polar, with the radius along u; on a sphere, a cylinder and a curve u runs around and v across.
+    """
+    kind = si.shape.shape_type()
+    is_disk = kind == int(mi.ShapeType.Disk)
+    is_round = (kind & sum(int(getattr(mi.ShapeType, name)) for name in _ROUND)) != 0
+    u, v = si.uv - 0.5
+    return dr.select(is_disk, 1, dr.select(is_round, 0, u)), dr.select(is_disk, 0, dr.select(is_round, 1, v))
 
 
 def _count(covered: list[mi.Bool]) -> mi.Float:

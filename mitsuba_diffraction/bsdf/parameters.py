@@ -419,7 +419,7 @@ class GratingRequest:
         media: around the grating.
         scales: of heights and of lengths along the surface; one in rigorous theory.
         orientation: degrees from the tangent to the pattern's x axis.
-        from_radius: whether they are from the radius, away from the centre of UV space, instead.
+        from_radius: whether they are from the radius, away from the centre of the surface, instead.
         material: R of scalar theory.
         stated: `material` or `int_ior` of the scene, as settings of a rigorous spectrum; None in scalar theory, and if
             the scene leaves them to the spectrum.

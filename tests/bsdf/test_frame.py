@@ -6,6 +6,8 @@ import numpy as np
 import pytest
 from bsdf_support import PERIOD, WAVELENGTHS, array, corner_blaze, evaluate, grating, vectors
 
+from mitsuba_diffraction.settings import lobe_width
+
 DOWN = (0.0, 0.0, -1.0)
 SQUARE = np.array([(0, 0), (1, 0), (1, 1), (0, 1)], float)
 S = np.sqrt(0.5)
@@ -173,8 +175,9 @@ def test_disk_has_x_along_its_radius():
     check({"type": "disk"}, (*(0.5 * x[:2]), 2), DOWN, (0, 0, 1), x, np.cross((0, 0, 1), x))
 
 
-def test_poles_of_a_sphere_are_finite():
-    bsdf = mi.load_dict(corner())
+@pytest.mark.parametrize("orientation", [0.0, "radial"])
+def test_poles_of_a_sphere_are_finite(orientation):
+    bsdf = mi.load_dict(corner(orientation=orientation))
     si = hit({"type": "sphere"}, (0, 0, 3), DOWN, bsdf)
     value = world(si, bsdf, orders(np.array([0, 0, 1.0]), *np.eye(3)))
     assert np.isfinite(value).all()
@@ -232,6 +235,82 @@ def test_a_radial_pattern_points_away_from_the_centre_of_uv_space(word, linear):
     if word == "tangential":
         x, y = y, -x
     check(mesh((SQUARE - centre) @ np.transpose(linear) + 0.5), (*point, 2), DOWN, (0, 0, 1), x, y, word)
+
+
+def test_a_radial_pattern_runs_along_a_curve(tmp_path):
+    (tmp_path / "curve.txt").write_text("-2 0 0 0.5\n-1 0 0 0.5\n1 0 0 0.5\n2 0 0 0.5\n")
+    curve = mi.load_dict({"type": "bsplinecurve", "filename": str(tmp_path / "curve.txt")})
+    n = np.array([0, 0.6, 0.8])
+    check(curve, (0.2, *(3 * n[1:])), -n, n, (1, 0, 0), np.cross(n, (1, 0, 0)), "radial")
+
+
+# Pictures of four shapes side by side, and what the grating equation predicts, from their geometry alone.
+SIDE, LINES, LENGTH = 24, 2.0, 4.0  # pixels of a shape; period and coherence length, µm
+BANDS = np.arange(0.42, 0.701, 0.04)  # µm
+SUN = np.array([0.3, 0.25, np.sqrt(1 - 0.3**2 - 0.25**2)])
+PLACES = {"rectangle": -3.6, "disk": -1.2, "sphere": 1.2, "cylinder": 3.6}
+
+
+def photographed(orientation):
+    """Return a picture (SIDE, 4 SIDE, bands) from above of line gratings in the sun; the axes of round shapes are y."""
+    at, upright = mi.ScalarTransform4f().translate, mi.ScalarTransform4f().rotate([1, 0, 0], -90)
+    inner = {"sphere": upright, "cylinder": upright @ at([0, 0, -1]) @ scale(1, 1, 2)}
+    lines = {"type": "diffraction_grating", "profile": "sinusoidal", "period": LINES, "depth": 0.1, "material": "none"}
+    bsdf = mi.load_dict({**lines, "coherence_length": LENGTH, "conserve_energy": False, "orientation": orientation})
+    peaks = {f"{x:.2f}".replace(".", "_"): f"{1e3 * x - 9}, {1e3 * x}, {1e3 * x + 9}" for x in BANDS}
+    bands = {name: {"type": "irregular", "wavelengths": peak, "values": "0, 1, 0"} for name, peak in peaks.items()}
+    above = mi.ScalarTransform4f().look_at([0, 0, 5], [0, 0, 0], [0, 1, 0]) @ scale(4.8, 4.8, 1)
+    film = {"type": "specfilm", "width": 4 * SIDE, "height": SIDE, "component_format": "float32", **bands}
+    film["rfilter"] = {"type": "box"}
+    scene = {
+        "type": "scene",
+        "integrator": {"type": "path", "max_depth": 2},
+        "sensor": {"type": "orthographic", "to_world": above, "film": film},
+        "sun": {"type": "directional", "direction": (-SUN).tolist(), "irradiance": {"type": "uniform", "value": 1.0}},
+        **{
+            name: {"type": name, "to_world": at([x, 0, 0]) @ inner.get(name, scale(1, 1, 1)), "bsdf": bsdf}
+            for name, x in PLACES.items()
+        },
+    }
+    return np.array(mi.render(mi.load_dict(scene), spp=128, seed=1))
+
+
+def predicted(shape, word):
+    """Return the lobes of the orders ±1 on one shape, (SIDE, SIDE, bands), and where to compare them.
+
+    Left out are the outlines and the mirror image of the sun.
+    """
+    at = 1.2 * ((np.arange(4 * SIDE) + 0.5) / (2 * SIDE) - 1)
+    x, y = np.meshgrid(at, -at)
+    z = {"sphere": np.sqrt(np.maximum(1 - x**2 - y**2, 0)), "cylinder": np.sqrt(np.maximum(1 - x**2, 0))}
+    normals = {"sphere": (x, y, z.get(shape)), "cylinder": (x, 0 * y, z.get(shape))}
+    n = np.stack(normals.get(shape, (0 * x, 0 * x, 0 * x + 1)), -1)
+    axis = np.broadcast_to([0, 1.0, 0], n.shape)
+    across = {"sphere": axis - n * n[..., 1:2], "cylinder": axis}.get(shape, np.stack([x, y, 0 * x], -1))
+    if word == "tangential":
+        across = np.cross(n, across)
+    across = across / np.linalg.norm(across, axis=-1, keepdims=True)
+    both = SUN + np.array([0, 0, 1.0])
+    q = ((both - n * (n @ both)[..., None])[..., None, :]) / BANDS[:, None]
+    lobes = sum(
+        np.exp(-((q - m * across[..., None, :] / LINES) ** 2).sum(-1) / (2 * lobe_width(LENGTH) ** 2)) for m in (-1, 1)
+    )
+    far = np.hypot(x, y) if shape in ("disk", "sphere") else np.maximum(np.abs(x), np.abs(y))
+    inside = ((far < 0.9) & (n @ SUN > 0.15))[..., None] & ((q**2).sum(-1) > (4 * lobe_width(LENGTH)) ** 2)
+    pixels = lambda fine: fine.reshape(SIDE, 4, SIDE, 4, -1)  # noqa: E731
+    return pixels(lobes).mean((1, 3)), pixels(inside).all((1, 3))
+
+
+@pytest.mark.parametrize("word", ["radial", "tangential"])
+def test_pictures_of_radial_patterns_follow_the_grating_equation(word):
+    # Regression: on disks, whose UVs are polar, on spheres and on cylinders the colours lay elsewhere.
+    for shape, picture in zip(PLACES, np.split(photographed(word), 4, axis=1), strict=True):
+        agreement = {}
+        for other in ("radial", "tangential"):
+            lobes, where = predicted(shape, other)
+            agreement[other] = np.corrcoef(lobes[where], picture[where])[0, 1]
+        assert agreement.pop(word) > 0.8, shape
+        assert max(agreement.values()) < 0.2, shape
 
 
 def test_the_centre_of_a_radial_pattern_is_finite():

@@ -7,25 +7,19 @@ uniform mat3 uCamera;   // columns: right, up, back
 uniform vec2 uTangentOfView;
 uniform vec2 uJitter;
 uniform vec2 uSize;
-uniform bool uFromRadius;  // whether the tangent points away from the centre of UV space
+uniform bool uFromRadius;  // whether the tangent points away from the centre, on a sphere from its north pole
 uniform vec4 uWall;        // height of the plate above the wall, half the sides of both, and zero
 uniform vec3 uRings;       // of a disc, between the radii of its hole, and of the inner and outer edge of its grating
 layout(location = 0) out vec4 oPosition;
 layout(location = 1) out vec4 oNormal;
 layout(location = 2) out vec4 oTangent;
 
-const float PI = 3.14159265, CLEAR = 0.25;
+const float CLEAR = 0.25;
 
-// The image of the radius in UV space; U and V are the derivatives of the position.
-vec4 tangentOf(vec2 uv, vec3 U, vec3 V) {
-  vec3 tangent = uFromRadius ? (uv.x - 0.5) * U + (uv.y - 0.5) * V : U;
+vec4 tangentOf(vec3 along, vec3 radius) {
+  vec3 tangent = uFromRadius ? radius : along;
   float size = length(tangent);
   return vec4(size > 0.0 ? tangent / size : vec3(1.0, 0.0, 0.0), 0.0);
-}
-
-float angleOf(vec2 p) {
-  float angle = dot(p, p) > 0.0 ? atan(p.y, p.x) : 0.0;
-  return (angle < 0.0 ? angle + 2.0 * PI : angle) / (2.0 * PI);
 }
 
 void main() {
@@ -42,8 +36,7 @@ void main() {
     oNormal = vec4(p, 0.0);
     float r = length(p.xy);
     vec2 outward = r > 0.0 ? p.xy / r : vec2(1.0, 0.0);
-    vec2 uv = vec2(angleOf(p.xy), acos(clamp(p.z, -1.0, 1.0)) / PI);
-    oTangent = tangentOf(uv, 2.0 * PI * vec3(-p.y, p.x, 0.0), PI * vec3(p.z * outward, -r));
+    oTangent = tangentOf(vec3(-p.y, p.x, 0.0), vec3(p.z * outward, -r));
     return;
   }
   if (uShape == 3) {
@@ -68,7 +61,7 @@ void main() {
   oPosition = vec4(p, uShape == 1 || (r >= uRings.y && r <= uRings.z) ? 1.0 : CLEAR);
   oNormal = vec4(0.0, 0.0, 1.0, 0.0);
   if (uShape == 1) {
-    oTangent = tangentOf(0.5 * p.xy + 0.5, vec3(2.0, 0.0, 0.0), vec3(0.0, 2.0, 0.0));
+    oTangent = tangentOf(vec3(1.0, 0.0, 0.0), vec3(p.xy, 0.0));
   } else {
     // Mitsuba's disk has polar UVs, so that its tangent points outwards.
     oTangent = vec4(p.xy / max(r, 1e-6), 0.0, 0.0);

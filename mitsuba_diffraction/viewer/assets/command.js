@@ -14,9 +14,7 @@ function sceneOf(data, state, coil) {
   const differs = Math.abs(state.coherenceLength / own - 1) > 1e-3;
   if (grating.profile && differs) grating.coherence_length = Number(state.coherenceLength.toPrecision(4));
   const material = state.material === "dielectric" ? { int_ior: state.index } : { material: state.material };
-  // The UVs of a disk are polar, so that 0 is radial.
-  const named = state.fromRadius && state.shape !== "disc";
-  const orientation = named ? (state.orientation === 0 ? "radial" : "tangential") : state.orientation;
+  const orientation = state.fromRadius ? (state.orientation === 0 ? "radial" : "tangential") : state.orientation;
   const coat = state.coat === 1 ? {} : { coat_ior: state.coat };
   // A texture of directions for each scale, which the pattern's own angle would replace.
   const scales = state.shape === "coil" ? state.scales : "none";
