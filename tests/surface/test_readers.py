@@ -823,6 +823,67 @@ def test_numbers_of_a_csv_are_read(tmp_path, refuse, name, mark):
     refuse(name, "its lengths: got the unit 'V'")
 
 
+@pytest.mark.parametrize("name", ["scan.csv", "scan.txt", "scan.xyz", "scan.asc"])
+@pytest.mark.parametrize("mark", [",", ";", "\t", " "])
+def test_a_line_of_names_is_skipped_in_every_text(tmp_path, name, mark):
+    path = tmp_path / name
+    if name != "scan.asc":
+        lines = points(digits=8).replace(" ", mark)
+        for names in ("x y z", "X Y Information"):
+            path.write_text(f"{names.replace(' ', mark)}\n{lines}")
+            np.testing.assert_allclose(read_height_field(path, unit="um").heights, HEIGHTS)
+        path.write_text(f"x [um]{mark}y [um]{mark}nanometres (nm)\n{lines}")
+        np.testing.assert_allclose(read_height_field(path).heights, 1e-3 * HEIGHTS)
+    if name != "scan.xyz":
+        lines = "\n".join(mark.join(str(h) for h in [*row, 0.1]) for row in HEIGHTS)
+        path.write_text(f"heights [nm]\n{lines}")
+        np.testing.assert_allclose(read_height_field(path, 0.1).heights[:, :3], 1e-3 * HEIGHTS)
+
+
+@pytest.mark.parametrize("mark", [",", ";", "\t", " \t "])
+@pytest.mark.parametrize("comma", [False, True])
+def test_empty_cells_are_missing(tmp_path, refuse, mark, comma):
+    heights = np.random.default_rng(0).uniform(0.1, 0.4, (4, 5))
+    heights[1, 1:3], heights[0, 4], heights[2, 0], heights[3] = np.nan, np.nan, np.nan, [0, np.nan, 0.5, np.nan, 1]
+    cells = [["" if np.isnan(h) else f"{h:.6g}" for h in row] for row in heights]
+    text = "\n".join(mark.join(row) for row in cells)
+    if comma and mark == ",":
+        return
+    text = text.replace(".", ",") if comma else text
+    empty = mark * 4
+    for more in (text, f"{text}\n{empty}\n", text.replace("\n", f"{mark}\n") + mark):  # an empty line, or column
+        (tmp_path / "scan.csv").write_text(more)
+        found = read_height_field(tmp_path / "scan.csv", 0.1, unit="um", keep_missing=True).heights
+        np.testing.assert_allclose(found, heights, rtol=1e-5)
+    refuse("scan.csv", "6 of 20 pixels are missing", unit="um")
+    lines = points(digits=6).replace(" ", mark).splitlines()
+    (tmp_path / "scan.xyz").write_text("\n".join([*lines[:-1], lines[-1].rpartition(mark)[0] + mark]))
+    found = read_height_field(tmp_path / "scan.xyz", unit="um", keep_missing=True).heights
+    assert np.isnan(found).sum() == 1
+
+
+def test_cells_that_are_no_pixels_are_not_missing(tmp_path, refuse):
+    (tmp_path / "scan.txt").write_text("0.1\t\t0.2\n0.3\t\t0.4\n")  # tabs that align
+    np.testing.assert_array_equal(
+        read_height_field(tmp_path / "scan.txt", 0.1, unit="um").heights, [[0.1, 0.2], [0.3, 0.4]]
+    )
+    (tmp_path / "scan.csv").write_text(",0,0.1,0.2\n0,1,2,3\n0.1,4,5,7\n0.2,1,1,2\n")
+    refuse("scan.csv", "the first line and column may be coordinates", unit="um")
+    (tmp_path / "scan.csv").write_text("1,,2\n3,four,5\n")
+    refuse("scan.csv", "not a table of numbers", unit="um")
+
+
+@pytest.mark.parametrize("encoding", ["utf-16", "utf-16-le", "utf-16-be", "utf-8-sig"])
+def test_a_text_of_windows_with_a_byte_order_mark_is_read(tmp_path, encoding):
+    header = "# Channel: Höhe\n# Width: 0.300 µm\n# Height: 400 nm\n# Value units: m\n"
+    for name, text in {"scan.csv": points(digits=8), "scan.xyz": points(digits=8), "export": header + MATRIX}.items():
+        mark = "" if encoding in ("utf-16", "utf-8-sig") else "\ufeff"
+        (tmp_path / name).write_bytes((mark + text).replace("\n", "\r\n").encode(encoding))
+        field = read_height_field(tmp_path / name, unit=None if name == "export" else "um")
+        np.testing.assert_allclose(field.heights, HEIGHTS)
+        assert field.pixel_size == pytest.approx((0.1, 0.2))
+
+
 def test_a_table_of_whole_decimal_commas_is_read_as_csv(tmp_path):
     (tmp_path / "scan.csv").write_text("\n".join(";".join(str(h).replace(".", ",") for h in row) for row in HEIGHTS))
     np.testing.assert_allclose(read_height_field(tmp_path / "scan.csv", 0.1, unit="um").heights, HEIGHTS)

@@ -26,7 +26,9 @@ from .scan import (
     MAX_PIXEL,
     MIN_HEIGHT_RANGE,
     MIN_PIXEL,
+    UTF_16,
     Scan,
+    decoded,
     is_possible_size,
     micrometres,
     pair,
@@ -234,6 +236,8 @@ def _extension_of_content(path: Path) -> str:
     """Guess the format from the first bytes; if that fails, return the file's own extension."""
     with open(path, "rb") as stream:
         start = stream.read(_HEADER_BYTES)
+    if start.startswith(UTF_16):
+        start = decoded(start).encode()
     if text.is_gwyddion_export(start):
         return ".asc"
     found = next((extension for magic, extension in _MAGIC.items() if start.startswith(magic)), path.suffix.lower())

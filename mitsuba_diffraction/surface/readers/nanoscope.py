@@ -65,7 +65,8 @@ def rewritten_nanoscope(data: bytes) -> tuple[bytes, list[str]]:
 
 def is_text(path: Path) -> bool:
     """Return whether a file that begins as one of Nanoscope is a text: in others, zero bytes follow the header."""
-    return b"\0" not in path.read_bytes()
+    data = path.read_bytes()
+    return b"\0" not in data or data.startswith(scan.UTF_16)
 
 
 def read_text(path: Path, unit: str | tuple[str, str] | None, channel: str | int | None) -> Scan:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import codecs
 import struct
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -77,8 +78,14 @@ def pair(unit: str | tuple[str, str] | None) -> tuple[str, str]:
     return units[0], units[1]
 
 
+UTF_16 = codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE
+"""First bytes of such a text."""
+
+
 def decoded(content: bytes) -> str:
-    """Return a text in UTF-8, or else in Latin-1, which programs on Windows write for µ and °."""
+    """Return a text in UTF-16 (with its mark), UTF-8, or else Latin-1, in which programs on Windows write µ and °."""
+    if content.startswith(UTF_16):
+        return content.decode("utf-16", errors="replace")
     try:
         return content.decode("utf-8-sig")
     except UnicodeDecodeError:

@@ -28,8 +28,10 @@ missing pixel. Lines that begin with # are comments; in two of them, Gwyddion wr
 
 or without a header, if pixel size and unit are given as arguments.
 
-.csv, .txt: either of them, points if there are three columns on a grid. A first line of names is skipped; it may hold
-units in brackets, as in "x [um],y [um],z [nm]".
+.csv, .txt: either of them, points if there are three columns on a grid.
+
+In all of them, a first line of names is skipped; it may hold units in brackets, as in "x [um],y [um],z [nm]". An empty
+cell between commas, semicolons or tabs is a missing pixel.
 """
 
 from __future__ import annotations
@@ -55,8 +57,10 @@ _GWYDDION = "Channel", "Width", "Height", "Value units"
 _SPIP_LINE = re.compile(r"#\s*([\w-]+)\s*[=:](.*)")
 _HEADER_LINE = re.compile(r"#\s*([^:\uff1a#]+?)\s*[:\uff1a](.*)")
 _LENGTH = re.compile(r"([-+.,\deE]*)(.*)")
+_BETWEEN_NAMES = re.compile(r"[;,\t]|(?<=[\])])\s+")
 BRACKETS = re.compile(r"[\[(]([^\])]*)[\])]\s*$")
-_NUMBER = re.compile(r"[-+.]*\d|[-+]?(nan|inf)", re.IGNORECASE)
+_NUMBER = re.compile(r"[-+.]*\d|[-+]?(nan|inf(inity)?)\b", re.IGNORECASE)
+_EMPTY_CELL = re.compile(r"^ *\t|\t *(?:\t|$)", re.MULTILINE)  # between tabs
 _DECIMAL_COMMA = re.compile(r"[-+]?\d+,\d+(?:[eE][-+]?\d+)?")
 _SPIP = {"x-pixels", "y-pixels", "x-length", "y-length"}
 _ESRI = ("ncols", "nrows", "xllcorner", "yllcorner", "xllcenter", "yllcenter", "cellsize", "nodata_value")
@@ -64,8 +68,20 @@ _ESRI = ("ncols", "nrows", "xllcorner", "yllcorner", "xllcenter", "yllcenter", "
 
 def read_points(path: Path, unit: str | tuple[str, str] | None) -> Scan:
     """Read points x y z on a regular grid."""
-    text = contents(path)
-    return _points(parse_table(text), unit, _units_of_points(text))
+    text, units = _below_names(contents(path))
+    return _points(parse_table(text), unit, units)
+
+
+def _below_names(text: str) -> tuple[str, tuple[str, str]]:
+    """Return a text without its first line, if that holds names, and the units of lengths and of heights in it."""
+    first, _, rest = text.lstrip().partition("\n")
+    names = [name.strip(' "') for name in _BETWEEN_NAMES.split(first) if name.strip()]
+    if not names or any(map(_NUMBER.match, names)) or first.startswith("#"):
+        return text, _units_of_points(text)
+    named = [match[1].strip() for name in names if (match := BRACKETS.search(name))]
+    if len(named) == len(names) and len({*named[:2]}) == 1:
+        return rest, (named[0], named[-1])
+    return rest, _units_of_points(text)
 
 
 def _units_of_points(text: str) -> tuple[str, str]:
@@ -108,15 +124,7 @@ def gridded(points: NDArray[np.float64]) -> tuple[NDArray[np.float64], tuple[flo
 
 def read_csv(path: Path, unit: str | tuple[str, str] | None) -> Scan:
     """Read points x y z, or a table of heights."""
-    text = contents(path)
-    first, _, rest = text.lstrip().partition("\n")
-    names = [name.strip(' "') for name in re.split("[;,\t]", first)]
-    units = _units_of_points(text)
-    if not any(_NUMBER.match(name) for name in names) and not first.startswith("#"):
-        text = rest
-        named = [match[1].strip() for name in names if (match := BRACKETS.search(name))]
-        if len(named) == len(names) and len({*named[:2]}) == 1:
-            units = named[0], named[-1]
+    text, units = _below_names(contents(path))
     numbers = parse_table(text)
     is_points = numbers.shape[1] == 3 and _may_be_points(numbers)
     return _points(numbers, unit, units) if is_points else _heights(text, unit, units[1])
@@ -124,13 +132,15 @@ def read_csv(path: Path, unit: str | tuple[str, str] | None) -> Scan:
 
 def read_table(path: Path, unit: str | tuple[str, str] | None) -> Scan:
     """Read a table of heights."""
-    return _heights(contents(path), unit)
+    text = contents(path)
+    if text.lstrip()[:5].lower() == "ncols":
+        return _esri(text, unit)
+    text, units = _below_names(text)
+    return _heights(text, unit, units[1])
 
 
 def _heights(text: str, unit: str | tuple[str, str] | None, own: str = "") -> Scan:
     """Read a table of heights; `own` is their unit in a file without a header."""
-    if text.lstrip()[:5].lower() == "ncols":
-        return _esri(text, unit)
     spip = {match[1].lower(): match[2].strip() for line in text.splitlines() if (match := _SPIP_LINE.match(line))}
     if spip.keys() >= _SPIP:
         return _spip(spip, parse_table(text), unit)
@@ -139,6 +149,8 @@ def _heights(text: str, unit: str | tuple[str, str] | None, own: str = "") -> Sc
     rows, columns = heights.shape
     if not header and columns == 3 and _may_be_points(heights):
         raise RequestError("three numbers a line that may be points x y z: wanted the extension .xyz for points")
+    if np.isnan(heights[0, 0]) and all(_is_even(line[1:]) for line in (heights[0], heights[:, 0])):
+        raise RequestError("the first line and column may be coordinates: wanted heights alone, or points x y z")
     along, _ = scan.pair(unit)
     scale = scan.scale_of_heights(header.get("Value units", own), unit)
     pixel_size = None
@@ -237,7 +249,7 @@ def contents(path: Path) -> str:
 
 
 def parse_table(text: str) -> NDArray[np.float64]:
-    """Parse numbers in lines of equal length, separated by white space, commas or semicolons."""
+    """Parse numbers in lines of equal length, separated by white space, commas or semicolons; empty cells are NaN."""
     first = next((line for line in text.splitlines() if line.strip() and not line.lstrip().startswith("#")), "")
     if not first:
         raise RequestError("the file holds no numbers")
@@ -246,15 +258,36 @@ def parse_table(text: str) -> NDArray[np.float64]:
         text, first = text.translate(point), first.translate(point)
     delimiter = next((mark for mark in (";", ",") if mark in first), None)
     try:
+        if delimiter is None and _EMPTY_CELL.search(text):
+            with suppress(ValueError):
+                return _with_empty_cells(text, "\t")
         with warnings.catch_warnings():
             warnings.simplefilter("error")
             return np.loadtxt(io.StringIO(text), dtype=np.float64, comments="#", delimiter=delimiter, ndmin=2)
     except (ValueError, UserWarning) as error:
+        if delimiter is not None:
+            with suppress(ValueError):
+                return _with_empty_cells(text, delimiter)
         if len(numbers) > 1 and "," in text and "." not in re.sub("#.*", "", text):
             # Commas are decimal, but the first line has whole numbers, too.
             with suppress(RequestError):
                 return parse_table(text.translate(point))
         raise RequestError(f"not a table of numbers ({error})") from None
+
+
+def _with_empty_cells(text: str, delimiter: str) -> NDArray[np.float64]:
+    """Return a table whose empty cells are NaN, without lines and columns of such cells at its edges.
+
+    Raises:
+        ValueError: if it is no table of numbers, or (tabs that align numbers) a column between others is empty.
+    """
+    lines = [line for line in (line.partition("#")[0] for line in text.splitlines()) if line.strip()]
+    cells = np.array([[cell.strip() for cell in line.split(delimiter)] for line in lines])
+    lines_used, used = (np.flatnonzero((cells != "").any(axis=axis)) for axis in (1, 0))
+    cells = cells[lines_used[0] : lines_used[-1] + 1, used[0] : used[-1] + 1]
+    if delimiter == "\t" and len(used) < cells.shape[1]:
+        raise ValueError("tabs that align numbers")
+    return np.where(cells == "", "nan", cells).astype(np.float64)
 
 
 def _grid(coordinates: NDArray[np.float64], axis: str) -> tuple[NDArray[np.int64], int, float]:
@@ -287,6 +320,12 @@ def _may_be_points(table: NDArray[np.float64]) -> bool:
     except (ValueError, OverflowError):
         return False
     return columns * rows == len(table) > 1
+
+
+def _is_even(numbers: NDArray[np.float64]) -> bool:
+    """Return whether these are the coordinates of at least three pixels."""
+    steps = np.diff(numbers)
+    return len(steps) > 1 and bool(np.allclose(steps, steps[0], rtol=_MAX_GRID_DEVIATION)) and bool(steps[0])
 
 
 def _length(text: str, unit: str) -> float:
