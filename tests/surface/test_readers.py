@@ -154,7 +154,7 @@ def write_holed(path):
 @pytest.mark.parametrize("name", ["scan.npy", "scan.npz", "scan.tif"])
 def test_missing_pixels_are_filled_on_request(tmp_path, refuse, name):
     write_holed(tmp_path / name)
-    refuse(name, r"2 of 8 pixels are missing .*row 0, column 1; .*fill_missing=True fills them")
+    refuse(name, r"2 of 8 pixels are missing .*row 0, column 1; .*fill_missing, which interpolates them")
     field = read_height_field(tmp_path / name, 0.1, fill_missing=True)
     np.testing.assert_allclose(field.heights, [[0.1, 0.2, 0.3, 0.4]] * 2, rtol=1e-6)
     assert (field.filled, field.source) == (2, f"{name} (2 missing pixels filled)")
@@ -353,7 +353,7 @@ def test_coloured_annotation_on_a_grey_picture_is_missing(tmp_path, refuse):
     picture = np.repeat(grey[..., None], 3, axis=-1)
     picture[42:45, 5:25] = (255, 0, 0)
     Image.fromarray(picture).save(tmp_path / "bar.png")
-    refuse("bar.png", r"2\.00% of the pixels are coloured, annotation .*fill_missing=True", height_range=1.0)
+    refuse("bar.png", r"2\.00% of the pixels are coloured, annotation .*fill_missing interpolates", height_range=1.0)
     kept = read_height_field(tmp_path / "bar.png", 0.1, 1.0, keep_missing=True)
     assert kept.gaps.sum() == kept.gaps[42:45, 5:25].sum() == 60
     filled = read_height_field(tmp_path / "bar.png", 0.1, 1.0, fill_missing=True)
