@@ -286,7 +286,7 @@ def _with_empty_cells(text: str, delimiter: str) -> NDArray[np.float64]:
     lines_used, used = (np.flatnonzero((cells != "").any(axis=axis)) for axis in (1, 0))
     cells = cells[lines_used[0] : lines_used[-1] + 1, used[0] : used[-1] + 1]
     if delimiter == "\t" and len(used) < cells.shape[1]:
-        raise ValueError("tabs that align numbers")
+        raise RequestError("tabs that align numbers")
     return np.where(cells == "", "nan", cells).astype(np.float64)
 
 
