@@ -9,7 +9,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import ArrayLike
 
-GROUPS = ("analytic", "literature", "statistical", "energy", "rigorous", "surface")
+GROUPS = ("analytic", "literature", "statistical", "energy", "rigorous", "surface", "scene")
 
 
 @dataclass(frozen=True)

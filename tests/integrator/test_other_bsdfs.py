@@ -6,6 +6,8 @@ import pytest
 from bsdf_support import bitmap
 from test_diffraction_path import SKY, SUN, assert_agree, blaze, plate, region_means, scene, tilted_normals
 
+from mitsuba_diffraction.evaluation.validation.scene_pictures import reference_integrator
+
 
 def colors():
     """A texture of saturated colors."""
@@ -96,3 +98,21 @@ def test_a_tinted_bsdf_is_no_noisier_than_with_path(llvm):
     (wanted, its_error), (found, error) = (region_means(built, each, 256, 48) for each in integrators)
     np.testing.assert_array_less(np.abs(found - wanted), 4 * np.hypot(its_error, error))
     assert error.max() < its_error.max()
+
+
+@pytest.mark.slow
+def test_the_opacity_of_a_mask_counts_once(llvm):
+    """`path` of Mitsuba 3.9.1 returns no light where a ray leaves the scene after null interactions alone."""
+    masked = {"type": "mask", "opacity": 0.7, "nested": {"type": "diffuse", "reflectance": rgb(0.5, 0.5, 0.5)}}
+    floor = {"type": "rectangle", "to_world": mi.ScalarTransform4f().scale(40), "bsdf": masked}
+    sensor = {"to_world": mi.ScalarTransform4f().look_at([9, 9, 4], [9, 9, 0], [0, 1, 0])}
+    # The grating, which is not in the picture, casts no light as far as that.
+    built = scene(sensor, floor=floor, wall=plate(blaze(), 0.01, height=30), sun=SUN)
+    means = {
+        name: np.array(mi.render(built, integrator=mi.load_dict({"type": name}), spp=1024)).mean()
+        for name in ("volpath", "prb", "path", "diffraction_path")
+    }
+    assert reference_integrator(built) == "prb"
+    assert means["diffraction_path"] == pytest.approx(means["volpath"], rel=0.01)
+    assert means["prb"] == pytest.approx(means["volpath"], rel=0.01)
+    assert means["path"] == pytest.approx(0.7 * means["volpath"], rel=0.01)

@@ -1,4 +1,4 @@
-"""`mitsuba-diffraction validate`: the BSDF against closed forms and rigorous results."""
+"""`mitsuba-diffraction validate`: the BSDF against closed forms and rigorous results, a scene against Mitsuba."""
 
 from __future__ import annotations
 
@@ -8,53 +8,62 @@ from typing import Annotated, Any
 
 import typer
 
-from ...cli.arguments import KEYS_OF_RECIPES, SURFACE, Overwrite, Variant
+from ...cli.arguments import KEYS_OF_RECIPES, SURFACE, Define, Overwrite, Variant, scene_parameters
 from ...errors import RequestError
 from ...files import outputs
 from ...precomputation.recipe import Recipe
 from ...precomputation.surface_text import parsed
 from ...progress import progress_bar, show, tell
+from ..record import Check
 
 
 def validate(
     surface: Annotated[
         str | None,
         typer.Argument(
-            metavar=f"[{SURFACE}]", help=f"check only this recipe (.toml), profile or scan; {KEYS_OF_RECIPES}"
+            metavar=f"[{SURFACE} | SCENE]",
+            help=f"check only this recipe (.toml), profile, scan or scene (.xml); {KEYS_OF_RECIPES}",
         ),
     ] = None,
+    define: Define = None,
     variant: Variant = None,
     json: Annotated[Path | None, typer.Option(help="save the results (.json)")] = None,
     markdown: Annotated[Path | None, typer.Option(help="save a table with notes and sources (.md)")] = None,
     overwrite: Overwrite = False,
 ) -> None:
-    """Check the BSDF against closed forms and rigorous results, or check one surface; fail if a bound is exceeded."""
+    """Check the BSDF, a surface, or the picture of a scene against Mitsuba's own; fail if a bound is exceeded."""
     import mitsuba as mi
 
-    from ...precomputation.grating_spectrum import GratingSpectrum
+    from ...render.scene_file import SceneFile
     from ...variants import choose_variant
     from .. import report
-    from ..validation.checks import checks, surface_checks
+    from ..validation.checks import checks
+    from ..validation.scene_pictures import compare_scene
 
     chosen = choose_variant(variant)
-    source, values = ("", {}) if surface is None else parsed(surface)
+    scene = SceneFile(surface, scene_parameters(define)) if surface and surface.lower().endswith(".xml") else None
+    if define and scene is None:
+        raise RequestError(f"-D: got {surface or 'no scene'}, wanted a scene (.xml), which has parameters")
+    source, values = ("", {}) if surface is None or scene is not None else parsed(surface)
     recipe = _recipe(source, values) if source else None
-    reads = [] if recipe is None else [Path(source), *recipe.files]
+    reads = scene.files() if scene is not None else [] if recipe is None else [Path(source), *recipe.files]
     writes = [(option, path) for option, path in (("--json", json), ("--markdown", markdown)) if path is not None]
     outputs.check_outputs(reads, writes, overwrite=overwrite)
     mi.set_variant(chosen)
-    if recipe is None:
-        these = checks()
+    if scene is not None:
+        with progress_bar("pictures") as progress:
+            comparison = compare_scene(scene, progress)
+        results = comparison.records
     else:
-        spectrum = recipe.cached(progress_bar)
-        assert isinstance(spectrum, GratingSpectrum)  # `_recipe` refuses rigorous theory
-        these = surface_checks(recipe.height_field(), spectrum)
-    results = []
-    with progress_bar("validation") as progress:
-        for check in these:
-            results.append(check.run())
-            progress(len(results), len(these))
+        these = checks() if recipe is None else _surface_checks(recipe)
+        results = []
+        with progress_bar("validation") as progress:
+            for check in these:
+                results.append(check.run())
+                progress(len(results), len(these))
     show(report.record_table(results), width=120)
+    if scene is not None:
+        tell(str(comparison))
     missed = [result.name for result in results if not result.ok]
     promised = sum(result.bound is not None for result in results)
     tell(
@@ -67,6 +76,15 @@ def validate(
         report.save_markdown(report.record_markdown(results), markdown)
     if missed:
         raise RuntimeError(f"{len(missed)} of {promised} checks missed: {'; '.join(missed)}")
+
+
+def _surface_checks(recipe: Recipe) -> tuple[Check, ...]:
+    from ...precomputation.grating_spectrum import GratingSpectrum
+    from ..validation.checks import surface_checks
+
+    spectrum = recipe.cached(progress_bar)
+    assert isinstance(spectrum, GratingSpectrum)  # `_recipe` refuses rigorous theory
+    return surface_checks(recipe.height_field(), spectrum)
 
 
 def _recipe(source: str, values: dict[str, Any]) -> Recipe:
