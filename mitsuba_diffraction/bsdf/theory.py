@@ -233,9 +233,9 @@ class ScalarTheory(Theory):
         self.wavelengths, self.light = (shortest * index, longest * index), light
         if light and self.spectrum.waves is not None:
             outside = index if self.media.eta is None else self.media.outside
-            if warning := self.spectrum.waves.error(light, outside).warning:
-                of_glass = "" if self.material.transparent else "; this is the error of glass, that of metals differs"
-                _warn(self.spectrum.source, warning + of_glass)
+            error = self.spectrum.waves.error(light, outside, transparent=self.material.transparent)
+            if error.warning:
+                _warn(self.spectrum.source, error.warning)
 
     def _films_changed(self) -> bool:
         """Return whether films differ from the films of the tables by more than `MAX_FILM_CHANGE`."""

@@ -90,7 +90,7 @@ def efficiency(
     else:
         with progress_bar(f"efficiencies of {name}") as progress:
             found = order_efficiencies(recipe.height_field(), below, *light, theory, transmission, progress)
-            warning = scalar_error(recipe.height_field()).warning if theory == "scalar" else ""
+            warning = scalar_error(recipe.height_field(), below=below).warning if theory == "scalar" else ""
     tell(str(found))
     if warning:
         tell(f"! {warning}")

@@ -137,7 +137,7 @@ def _write_orders(title: str, recipe: Recipe, parameters: dict[str, Any], output
             sides = "from both sides" if grating.transmits else "from above"
             unit = "wavelength" if len(wavelengths) == 1 else "wavelengths"
             what = f"{len(wavelengths)} {unit} × {len(angles)} × {len(azimuths)} directions of light {sides}"
-    warning = scalar_error(grating.height_field).warning if grating.theory == "scalar" else ""
+    warning = scalar_error(grating.height_field, below=grating.below).warning if grating.theory == "scalar" else ""
     if warning:
         tell(f"! {warning}")
     tell(f"{output}: {grating.description}; {what}")

@@ -200,7 +200,8 @@ class RefractiveIndex:
 
 def constant(index: complex) -> RefractiveIndex:
     """Return an index without dispersion."""
-    return RefractiveIndex(f"{index:g}", np.zeros(1), np.array([index], np.complex128))
+    name = f"{index.real:g}" if index.imag == 0 else f"{index:g}"
+    return RefractiveIndex(name, np.zeros(1), np.array([index], np.complex128))
 
 
 def index_of(name: str, index: complex | str | os.PathLike[str]) -> RefractiveIndex:

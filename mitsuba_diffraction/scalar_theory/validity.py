@@ -17,6 +17,7 @@ import numpy as np
 
 from ..array_types import Real
 from ..errors import RequestError
+from ..optics.media import MediumBelow
 from ..rigorous.coordinate_transformation import curve_of, is_profile
 from ..rigorous.rigorous_spectrum import MAX_PERIOD_IN_WAVELENGTHS
 from ..rigorous.solver import converge
@@ -43,6 +44,7 @@ MAX_TRUSTED_ERROR = 0.1  # above which a surface is considered outside the range
 # R.m.s. factor between the estimated error, from the map, and the solved error of 48 profiles; docs/validation.md.
 ESTIMATE_FACTOR = 1.4
 _MAX_SOLVER_ERROR = 1e-2
+_MAX_ACROSS = 1e-3  # of the variance of slopes along lines, relative to that across them, for a line grating
 
 
 def equivalent_depth(rms_height: float) -> float:
@@ -127,21 +129,23 @@ def expected_error(
 
 @dataclass(frozen=True)
 class ScalarError:
-    """The error of scalar theory for one surface: the mean over `ERROR_ANGLES` and some wavelengths, for n = 1.5.
+    """The error of scalar theory for one surface: the mean over `ERROR_ANGLES` and some wavelengths.
 
     Attributes:
         share: Σ|Δη_m| as a fraction of the reflected power; infinite outside the stored map (depths above 2 λ).
-        transmitted: the same for transmitted light.
+        transmitted: the same for transmitted light; None below a medium that absorbs it.
         estimated: whether it is from the stored map, within about `ESTIMATE_FACTOR`, instead of solved for the surface.
         remedy: the alternative to scalar theory for this surface.
         wavelengths: of which it is the mean, in air, µm.
+        medium: below the surface, for which it holds.
     """
 
     share: float
-    transmitted: float
+    transmitted: float | None
     estimated: bool
     remedy: str
     wavelengths: tuple[float, ...]
+    medium: str = f"n = {INDEX:g}"
 
     @property
     def bound(self) -> float:
@@ -159,9 +163,12 @@ class ScalarError:
         if not np.isfinite(self.share):
             return f"error unknown, the surface is deeper than two wavelengths ({light})"
         about = "about " if self.estimated else ""
-        reflected, transmitted = (f"{float(f'{100 * error:.2g}'):g}%" for error in (self.share, self.transmitted))
-        conditions = f"mean over {light} and 0–{max(ERROR_ANGLES):g}°, n = {INDEX:g}"
-        return f"errs by {about}{reflected} of the reflected light, {transmitted} of the transmitted ({conditions})"
+        errors = ((self.share, "reflected light"), (self.transmitted, "transmitted"))
+        parts = [
+            f"{float(f'{100 * error:.2g}'):g}% of the {of_light}" for error, of_light in errors if error is not None
+        ]
+        conditions = f"mean over {light} and 0–{max(ERROR_ANGLES):g}°, {self.medium}"
+        return f"errs by {about}{', '.join(parts)} ({conditions})"
 
 
 @dataclass(frozen=True)
@@ -173,7 +180,8 @@ class Waves:
         periods: µm, (n,).
         power: the fraction of the variance of each, (n,).
         width: of a profile along x, to which rigorous theory applies, µm; None of other surfaces.
-        solved: the error of such a profile, solved for one light.
+        solved: the error of such a profile on n = 1.5, solved for one light.
+        turned: angle from y to the lines of a surface that varies along one other direction alone, degrees; else 0.
     """
 
     depth: float
@@ -181,6 +189,7 @@ class Waves:
     power: tuple[float, ...]
     width: float | None = None
     solved: ScalarError | None = None
+    turned: float = 0.0
 
     @classmethod
     def of(cls, height_field: HeightField, extent: str) -> Waves:
@@ -192,20 +201,28 @@ class Waves:
         sums = np.bincount(where, power[kept]) / max(power.sum(), 1e-300)
         periods = 2 ** (found / _WAVES_PER_OCTAVE)
         width = height_field.tile_size[0] if extent == "tile" and is_profile(height_field) else None
-        return cls(float(equivalent_depth(rms_height)), tuple(periods.tolist()), tuple(sums.tolist()), width)
+        turned = _turned(height_field) if width is None and min(height_field.shape) > 1 else 0.0
+        return cls(
+            float(equivalent_depth(rms_height)), tuple(periods.tolist()), tuple(sums.tolist()), width, turned=turned
+        )
 
-    def error(self, light: tuple[float, float] = VISIBLE, index: float = 1.0) -> ScalarError:
+    def error(
+        self, light: tuple[float, float] = VISIBLE, index: float = 1.0, *, transparent: bool = True
+    ) -> ScalarError:
         """Return the error in light of (shortest, longest) wavelengths, nm, in a medium of an index above the surface.
 
         The map is averaged over the waves, each weighted by its fraction of the variance, at the depth of the sinusoid
-        of equal roughness. Periods outside the map take the value at its boundary.
+        of equal roughness. Periods outside the map take the value at its boundary. Below the surface is n = 1.5, or,
+        unless `transparent`, aluminium, which stands for all metals.
         """
         wavelengths = error_wavelengths(light)
-        if self.solved is not None and self.solved.wavelengths == wavelengths and index == 1:
+        if self.solved is not None and self.solved.wavelengths == wavelengths and index == 1 and transparent:
             return self.solved
-        inside = [wavelength / index for wavelength in wavelengths]
+        inside, remedy = [wavelength / index for wavelength in wavelengths], self.remedy(light[0] * 1e-3 / index)
+        if not transparent:
+            return ScalarError(self._estimated("Al", inside), None, True, remedy, wavelengths, "aluminium")
         share, transmitted = (self._estimated(name, inside) for name in ("dielectric", "transmitted"))
-        return ScalarError(share, transmitted, True, self._remedy(light[0] * 1e-3 / index), wavelengths)
+        return ScalarError(share, transmitted, True, remedy, wavelengths)
 
     def _estimated(self, material: str, wavelengths: Sequence[float]) -> float:
         """Return the mean error over wavelengths in µm; infinite for too large a depth."""
@@ -221,12 +238,15 @@ class Waves:
             total += float(np.exp(of_waves) @ self.power)
         return total / len(wavelengths)
 
-    def _remedy(self, shortest: float) -> str:
+    def remedy(self, shortest: float) -> str:
+        """Return the alternative to scalar theory for wavelengths from `shortest`, µm."""
         max_period = MAX_PERIOD_IN_WAVELENGTHS * shortest
+        if self.turned:
+            return f"its lines run at {self.turned:.3g}° from y; for lines along y (`rotate`) there is rigorous theory"
         if self.width is None:
-            return "no rigorous theory is offered for a surface that varies along y"
+            return "no rigorous theory is offered for a surface that varies along x and y"
         if self.width > max_period:
-            return f"rigorous theory is offered for tiles of up to {max_period:.2g} µm along x"
+            return f"scenes have rigorous theory for periods of up to {max_period:.2g} µm, `efficiency` for longer ones"
         return "theory=rigorous has it right"
 
     def as_plain(self) -> dict[str, Any]:
@@ -252,30 +272,60 @@ def error_wavelengths(light: tuple[float, float]) -> tuple[float, ...]:
 
 def scalar_waves(height_field: HeightField, extent: str = "tile", light: tuple[float, float] = VISIBLE) -> Waves:
     """Determine the waves of a surface, and solve profiles to which rigorous theory applies for the light in nm."""
-    waves, wavelengths = Waves.of(height_field, extent), error_wavelengths(light)
-    if waves.width is None or waves.width > MAX_PERIOD_IN_WAVELENGTHS * light[0] * 1e-3:
-        return waves
-    # Deeper profiles take long to solve, and are far outside the range.
-    if waves.depth > wavelengths[0]:
-        return waves
-    row = tuple(height_field.heights[0].tolist())
-    solved = _solved_error(row, height_field.pixel_size, wavelengths, ERROR_ANGLES) if waves.depth > 0 else (0.0, 0.0)
-    if not np.isfinite(solved[0]):
-        return waves
-    return replace(waves, solved=ScalarError(*solved, False, waves.error(light).remedy, wavelengths))
+    waves = Waves.of(height_field, extent)
+    return replace(waves, solved=_solved(height_field, waves, light, MediumBelow.of()))
 
 
-def scalar_error(height_field: HeightField, extent: str = "tile", light: tuple[float, float] = VISIBLE) -> ScalarError:
+def scalar_error(
+    height_field: HeightField,
+    extent: str = "tile",
+    light: tuple[float, float] = VISIBLE,
+    below: MediumBelow | None = None,
+) -> ScalarError:
     """Determine the error of scalar theory for a surface; a "sample" is levelled first.
 
-    Periodic profiles to which rigorous theory applies are solved. For any other surface it is estimated (`Waves`).
+    Periodic profiles to which rigorous theory applies are solved, on the medium below. For any other surface, and the
+    perfect mirror, it is estimated (`Waves`).
 
     Args:
         height_field: the surface.
         extent: "tile" or "sample".
         light: (shortest, longest) wavelengths, nm.
+        below: the medium below; n = 1.5 of none.
     """
-    return scalar_waves(height_field, extent, light).error(light)
+    waves, below = Waves.of(height_field, extent), below or MediumBelow.of()
+    solved = _solved(height_field, waves, light, below)
+    return solved or waves.error(light, transparent=below.transparent)
+
+
+def _turned(height_field: HeightField) -> float:
+    """Return the angle from y to lines of equal height, degrees; 0 unless gradients have one direction."""
+    slopes = [slope.ravel() for slope in reversed(np.gradient(height_field.centred, *height_field.pixel_size[::-1]))]
+    (across, along), directions = np.linalg.eigh(np.cov(slopes))
+    if across > _MAX_ACROSS * along:
+        return 0.0
+    x, y = directions[:, 1]
+    return float(np.degrees(np.arctan2(y, x)) % 180)
+
+
+def _solved(
+    height_field: HeightField, waves: Waves, light: tuple[float, float], below: MediumBelow
+) -> ScalarError | None:
+    """Solve a profile to which rigorous theory applies; None of any other surface, and unless the solver converges."""
+    wavelengths = error_wavelengths(light)
+    if waves.width is None or waves.width > MAX_PERIOD_IN_WAVELENGTHS * light[0] * 1e-3 or below.index is None:
+        return None
+    # Deeper profiles take long to solve, and are far outside the range.
+    if waves.depth > wavelengths[0]:
+        return None
+    reflected = transmitted = 0.0
+    if waves.depth > 0:
+        row, indices = tuple(height_field.heights[0].tolist()), tuple(below.at(length) for length in wavelengths)
+        reflected, transmitted = _solved_error(row, height_field.pixel_size, wavelengths, ERROR_ANGLES, indices)
+    if not np.isfinite(reflected):
+        return None
+    remedy, through = waves.remedy(light[0] * 1e-3), transmitted if below.transparent else None
+    return ScalarError(reflected, through, False, remedy, wavelengths, str(below))
 
 
 @functools.lru_cache(maxsize=64)
@@ -284,24 +334,26 @@ def _solved_error(
     pixel_size: tuple[float, float],
     wavelengths: tuple[float, ...],
     angles: tuple[float, ...],
+    indices: tuple[complex, ...],
 ) -> tuple[float, float]:
     """Compute the mean error of reflected and of transmitted light; NaN if the solver does not converge.
+
+    Below the profile is a medium of an index for each wavelength; one that absorbs transmits nothing.
 
     One profile has several spectra, such as those of a study of convergence.
     """
     profile = HeightField(np.array([heights]), pixel_size)
     period, powers, curve = profile.tile_size[0], profile_powers(profile), curve_of(profile)
     errors = []
-    for wavelength in wavelengths:
+    for wavelength, index in zip(wavelengths, indices, strict=True):
         for angle in angles:
             omega_i = np.array([-np.sin(np.deg2rad(angle)), 0.0, np.cos(np.deg2rad(angle))])
-            exact = converge(curve, omega_i, period / wavelength, INDEX, _MAX_SOLVER_ERROR)
+            exact = converge(curve, omega_i, period / wavelength, index, _MAX_SOLVER_ERROR)
             if not exact.error <= _MAX_SOLVER_ERROR:
                 return float("nan"), float("nan")
-            pairs = (
-                (scalar_orders(powers, period, wavelength, angle, INDEX), exact.reflection),
-                (transmitted_orders(powers, period, wavelength, angle, INDEX), exact.transmission),
-            )
+            pairs = [(scalar_orders(powers, period, wavelength, angle, index), exact.reflection)]
+            if index.imag == 0:
+                pairs.append((transmitted_orders(powers, period, wavelength, angle, index.real), exact.transmission))
             # Only one of the theories may include an order exactly at the horizon, which has no power.
             errors.append(
                 [
@@ -311,5 +363,5 @@ def _solved_error(
                     for one, two in pairs
                 ]
             )
-    reflected, transmitted_ = np.mean(errors, axis=0)
-    return float(reflected), float(transmitted_)
+    mean = np.mean(errors, axis=0)
+    return float(mean[0]), float(mean[-1])

@@ -18,6 +18,7 @@ from mitsuba_diffraction.evaluation.validation import analytic, conservation, co
 from mitsuba_diffraction.evaluation.validation.checks import checks, scalar_range, surface_checks
 from mitsuba_diffraction.files import outputs
 from mitsuba_diffraction.optics import geometry
+from mitsuba_diffraction.optics.media import MediumBelow
 from mitsuba_diffraction.rigorous.solver import converge
 from mitsuba_diffraction.scalar_theory import closed_form, validity
 
@@ -167,6 +168,34 @@ def test_the_map_of_transmitted_light_agrees_with_the_solver(way, period, depth,
     )
 
 
+@pytest.mark.parametrize(
+    ("lines", "blaze", "glass", "aluminium"), [(600, 500, 0.103, 0.192), (1200, 500, 0.286, 0.464)]
+)
+def test_the_error_of_scalar_theory_is_that_on_the_medium_below(lines, blaze, glass, aluminium):
+    """Values: Σ|Δη|/Ση of the printed efficiencies of both theories, at 0° and ±20°, and 450, 550 and 650 nm."""
+    surface = md.gratings.ruled(lines, blaze_wavelength=blaze)
+    found = [scalar_theory.scalar_error(surface, below=MediumBelow.of(material)) for material in (None, "Al")]
+    assert [error.share for error in found] == pytest.approx([glass, aluminium], rel=0.01)
+    assert found[0].transmitted is not None
+    assert found[1].transmitted is None
+    assert str(found[1]).endswith(" of the reflected light (mean over 450–650 nm and 0–20°, Al)")
+    # The estimate of scenes has one metal, and sinusoids.
+    estimated = validity.scalar_waves(surface).error(transparent=False)
+    assert str(estimated).endswith(", aluminium)")
+    assert 0.5 < estimated.share / aluminium < 2
+
+
+def test_lines_in_another_direction_have_rigorous_theory_once_they_are_turned():
+    y, x = np.mgrid[:64, :64] * 0.1
+
+    def remedy(waves):
+        return validity.scalar_waves(md.HeightField(0.1 * np.sin(2 * np.pi / 3.2 * waves), 0.1)).remedy(0.36)
+
+    assert "lines run at 45° from y" in remedy(x + y)
+    assert "lines run at 90° from y" in remedy(y)
+    assert "for a surface that varies along x and y" in remedy(np.hypot(x - 3, y - 3))
+
+
 def test_a_surface_outside_the_range_of_scalar_theory_is_reported():
     fine = scalar_theory.scalar_error(md.gratings.ruled(1200)).warning
     assert fine.startswith("scalar theory: errs by 29% of the reflected light, ")
@@ -174,10 +203,10 @@ def test_a_surface_outside_the_range_of_scalar_theory_is_reported():
     assert fine.endswith("; theory=rigorous has it right")
     crossed = scalar_theory.scalar_error(md.gratings.foil(0.8, 0.5, samples=32)).warning
     assert "errs by about" in crossed
-    assert crossed.endswith("no rigorous theory is offered for a surface that varies along y")
+    assert crossed.endswith("no rigorous theory is offered for a surface that varies along x and y")
     deep = scalar_theory.scalar_error(md.gratings.sinusoidal(4.0, 1.5)).warning
     assert deep.startswith("scalar theory: error unknown, the surface is deeper than two wavelengths (450–650 nm); ")
-    assert deep.endswith("for tiles of up to 3.6 µm along x")
+    assert deep.endswith("scenes have rigorous theory for periods of up to 3.6 µm, `efficiency` for longer ones")
     for flat in (md.HeightField(np.zeros((1, 8)), 0.1), md.HeightField(np.full((8, 8), 0.7), 0.1)):
         for extent in ("tile", "sample"):
             assert scalar_theory.scalar_error(flat, extent).share == 0
