@@ -232,7 +232,7 @@ def render(
     on_load(scene)
     channels = channel_wavelengths(job.spectral_range).size
     with nullcontext() if checkpoint is None else exclusive(checkpoint):
-        sums = BandedSums(job.bands, columns, job.digest(), checkpoint, job.alpha, job.spectral_range)
+        sums = BandedSums(job.bands, job.samples, columns, job.digest(), checkpoint, job.alpha, job.spectral_range)
         complete = _trace(
             job,
             scene,
@@ -275,7 +275,7 @@ def _trace(
     with _deferred_interrupt() as interrupted, closing(tracer(job, scene, sums.done)) as traced:
         while not (complete or interrupted()):
             with stage("kernels and first pass" if sums.done == first else "rendering"):
-                sums.add(next(traced), job.samples[sums.done // len(job.bands)])
+                sums.add(next(traced))
             before, spent = (now := time.perf_counter()), spent + (now - before if sums.done > first + 1 else 0)
             if sums.done in estimates:
                 remaining = spent / sum(work[first + 1 : sums.done]) * sum(work[sums.done :])

@@ -1,8 +1,8 @@
 """Sums over the passes of a picture, the standard error of their mean, and their checkpoints.
 
-A checkpoint is an uncompressed `.npz` file (noise does not compress) with the fields of `Accumulation` and the `digest`
-of the request (`passes.Job`). Each field has a CRC-32. It takes 4 bytes per pixel and channel, and twice as much while
-it is being replaced.
+A checkpoint is a header of fixed size (its own SHA-256, the digest of the request, `Job.digest`, and the number of
+passes), and the arrays of `Accumulation`, uncompressed, as noise does not compress. Their shapes and types follow from
+the request. It takes 4 bytes per pixel and channel, and twice as much while it is being replaced.
 
 To bound memory, a large picture is traced in bands of rows (`trace_pass.bands_of`): in each pass, band after band is
 added to its sums. One band is in memory, the others are in checkpoints of their own.
@@ -14,19 +14,20 @@ import itertools
 import math
 import os
 import shutil
+import sys
 import tempfile
 import weakref
 from collections.abc import Iterator, Mapping
-from dataclasses import dataclass, fields
+from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
-from zipfile import BadZipFile
 
 import numpy as np
 from numpy.typing import NDArray
 
 from ..errors import RequestError
-from ..files.writing import discard, whole_file
+from ..files.reading import check_file
+from ..files.writing import UNSEALED, discard, is_intact, seal, whole_file
 from ..optics.color import spectrum_to_XYZ
 from ..settings import VISIBLE
 from .spectral_film import SpectralRange, channel_wavelengths
@@ -67,12 +68,18 @@ class Accumulation:
         luminance, squares = np.zeros((2, rows, columns))
         return cls(np.zeros((rows, columns, channels), np.float32), luminance, squares, spectral_range=spectral_range)
 
+    def arrays(self) -> tuple[NDArray, ...]:
+        """Return the arrays, in the order of a checkpoint."""
+        return self.sums, self.luminance, self.squares
+
     def add(self, traced: NDArray[np.float32], samples: int) -> None:
         """Add the result of `trace_pass` with that many samples per pixel."""
-        # einsum adds in a fixed order; a matrix product may be multithreaded.
         wavelengths = channel_wavelengths(self.spectral_range)
-        weights = spectrum_to_XYZ(np.eye(wavelengths.size), wavelengths)[:, 1].astype(np.float32)
-        luminance = np.einsum("yxi,i->yx", traced[..., : weights.size], weights).astype(np.float64)
+        weights = spectrum_to_XYZ(np.eye(wavelengths.size), wavelengths)[:, 1]
+        # einsum adds in an order that depends on the layout alone, which differs between machines of a cluster; a
+        # matrix product may be multithreaded.
+        rows = (np.ascontiguousarray(row[:, : weights.size], np.float64) for row in traced)
+        luminance = np.stack([np.einsum("xi,i->x", row, weights) for row in rows])
         luminance = ratio(luminance, traced[..., -1])
         self.sums += traced
         self.luminance += samples * luminance
@@ -140,33 +147,51 @@ def discard_checkpoints(checkpoint: str | os.PathLike[str]) -> None:
         discard(path)
 
 
+_TITLE = "mitsuba_diffraction checkpoint"
+_HEADER = f"{_TITLE}\n{UNSEALED}\n{{digest:64}}\n{{passes:7}}\n"
+_HEADER_BYTES = len(_HEADER.format(digest="", passes=0))
+
+
 def save_checkpoint(path: str | os.PathLike[str], digest: str, sums: Accumulation) -> None:
     """Write a checkpoint atomically: after a kill, a power cut or an OSError, `path` is the old or the new one."""
-    with whole_file(path) as temporary, open(temporary, "wb") as stream:
-        np.savez(stream, digest=digest, **vars(sums))
+    with whole_file(path) as temporary:
+        with open(temporary, "wb") as stream:
+            stream.write(_HEADER.format(digest=digest, passes=sums.passes).encode())
+            for array in sums.arrays():
+                stream.write(array.data)
+        seal(temporary)
 
 
-def load_checkpoint(path: str | os.PathLike[str], digest: str) -> Accumulation | None:
-    """Return the sums of the checkpoint of a request with this digest; None if there is no such file.
+def load_checkpoint(path: str | os.PathLike[str], digest: str, sums: Accumulation, samples: tuple[int, ...]) -> None:
+    """Read the checkpoint of a request with this digest, if there is such a file.
+
+    Args:
+        sums: of zero passes, with the shapes of the request; they are filled.
+        samples: per pixel, in each pass of the request.
 
     Raises:
         ValueError: if it is damaged, not a checkpoint, or one of another request.
     """
+    name = os.fspath(path)
     if not os.path.exists(path):
-        return None
+        return
+    check_file(path, sys.maxsize)
     with open(path, "rb") as stream:
-        try:
-            with np.load(stream) as content:
-                if content["digest"].item() == digest:
-                    stored = {field.name: content[field.name] for field in fields(Accumulation)}
-                    return Accumulation(**{name: x if x.ndim else x.item() for name, x in stored.items()})
-        # Raised by NumPy and zipfile for damaged files.
-        except (ValueError, KeyError, TypeError, EOFError, AttributeError, RuntimeError, OSError, BadZipFile) as error:
-            raise RequestError(f"{os.fspath(path)}: not a checkpoint, or a damaged one ({error})") from None
-    raise RequestError(
-        f"{os.fspath(path)}: of another rendering: the scene or a file that it references, an option or a version has "
-        "changed; repeat the original command, or remove the file to start over"
-    )
+        lines = stream.read(_HEADER_BYTES).split(b"\n")
+        if lines[0] != _TITLE.encode() or not is_intact(path):
+            raise RequestError(f"{name}: not a checkpoint, or a damaged one")
+        if lines[2] != digest.encode():
+            raise RequestError(
+                f"{name}: of another rendering: the scene or a file that it references, an option or a version has "
+                "changed; repeat the original command, or remove the file to start over"
+            )
+        passes = int(lines[3]) if lines[3].strip().isdigit() else -1
+        sizes = [array.nbytes for array in sums.arrays()]
+        if not 0 <= passes <= len(samples) or os.path.getsize(path) != _HEADER_BYTES + sum(sizes):
+            raise RequestError(f"{name}: sums of {passes} passes that do not suit the request; remove it to start over")
+        for array in sums.arrays():
+            stream.readinto(array.data.cast("B"))
+    sums.passes, sums.samples = passes, sum(samples[:passes])
 
 
 class BandedSums:
@@ -174,6 +199,7 @@ class BandedSums:
 
     Attributes:
         bands: rows of each band.
+        samples: per pixel, in each pass.
         done: number of additions so far: in each pass, one per band from top to bottom.
         errors: (height, width) float32, `Accumulation.relative_errors`.
         luminance: (height, width) float32, mean luminance.
@@ -183,6 +209,7 @@ class BandedSums:
     def __init__(
         self,
         bands: tuple[Rows, ...],
+        samples: tuple[int, ...],
         columns: int,
         digest: str,
         checkpoint: str | os.PathLike[str] | None,
@@ -190,7 +217,8 @@ class BandedSums:
         spectral_range: SpectralRange = VISIBLE,
     ) -> None:
         """Read existing checkpoints (errors: see `load_checkpoint`); without `checkpoint` they are temporary files."""
-        self.bands, self._columns, self._digest, self.spectral_range = bands, columns, digest, spectral_range
+        self.bands, self.samples, self.spectral_range = bands, samples, spectral_range
+        self._columns, self._digest = columns, digest
         if checkpoint is None and len(bands) > 1:
             checkpoint = Path(tempfile.mkdtemp(), "sums")
             weakref.finalize(self, shutil.rmtree, checkpoint.parent, ignore_errors=True)
@@ -208,17 +236,16 @@ class BandedSums:
         if index != self._index:
             self.release()
             (first, end), path = self.bands[index], self._paths[index]
-            stored = None if path is None else load_checkpoint(path, self._digest)
-            if stored is None:
-                stored = Accumulation.empty(end - first, self._columns, self.alpha is not None, self.spectral_range)
-            self._sums = stored
+            self._sums = Accumulation.empty(end - first, self._columns, self.alpha is not None, self.spectral_range)
+            if path is not None:
+                load_checkpoint(path, self._digest, self._sums, self.samples)
             self._index, self._saved = index, self._sums.samples
         return self._sums
 
-    def add(self, traced: NDArray[np.float32], samples: int) -> None:
+    def add(self, traced: NDArray[np.float32]) -> None:
         """Add the next result of `trace_pass`."""
-        index = self.done % len(self.bands)
-        self.band(index).add(traced, samples)
+        number, index = divmod(self.done, len(self.bands))
+        self.band(index).add(traced, self.samples[number])
         self._describe(index)
         self.done += 1
 
