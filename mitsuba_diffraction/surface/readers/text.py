@@ -282,12 +282,12 @@ def _with_empty_cells(text: str, delimiter: str) -> NDArray[np.float64]:
         ValueError: if it is no table of numbers, or (tabs that align numbers) a column between others is empty.
     """
     lines = [line for line in (line.partition("#")[0] for line in text.splitlines()) if line.strip()]
-    cells = np.array([[cell.strip() for cell in line.split(delimiter)] for line in lines])
-    lines_used, used = (np.flatnonzero((cells != "").any(axis=axis)) for axis in (1, 0))
-    cells = cells[lines_used[0] : lines_used[-1] + 1, used[0] : used[-1] + 1]
-    if delimiter == "\t" and len(used) < cells.shape[1]:
+    table = np.array([[float(cell) if cell.strip() else np.nan for cell in line.split(delimiter)] for line in lines])
+    rows, columns = (np.flatnonzero(~np.isnan(table).all(axis=axis)) for axis in (1, 0))
+    table = table[rows[0] : rows[-1] + 1, columns[0] : columns[-1] + 1]
+    if delimiter == "\t" and len(columns) < table.shape[1]:
         raise RequestError("tabs that align numbers")
-    return np.where(cells == "", "nan", cells).astype(np.float64)
+    return table
 
 
 def _grid(coordinates: NDArray[np.float64], axis: str) -> tuple[NDArray[np.int64], int, float]:
