@@ -203,13 +203,40 @@ def ibw(order="<", steps=(DX * 1e-6, DY * 1e-6), units=(b"m", b"m"), layers=0, c
     return head + header.ljust(320, b"\0") + max(layers, 1) * wave.tobytes("F") + note.encode() + names
 
 
-def jpk(lines=ROWS, image="", curves=0):
+def h5_jpk(reflect=False, frames=2, multiplier=-1e-13, pixels=ROWS * COLUMNS):
+    """JPK in HDF5: matrices of pixels by frames, of which the first has the relief; retrace before trace."""
+    import h5py
+
+    offset = 3e-7  # m, of height = multiplier · number + offset
+    whole = io.BytesIO()
+    with h5py.File(whole, "w") as file:
+        group = file.create_group("Measurement_000")
+        grid = {"ilength": COLUMNS, "jlength": ROWS, "ulength": COLUMNS * DX * 1e-6, "vlength": ROWS * DY * 1e-6}
+        grid |= {"unit.unit": b"m", "reflect": str(reflect).lower().encode()}
+        group.attrs.update({f"position-pattern.grid.{name}": value for name, value in grid.items()})
+        channels = [("error", "Error Signal", False, "V", 1), ("height", "Height", True, "m", 2)]
+        channels.append(("height", "Height", False, "m", 1))
+        for number, (name, fancy, retrace, unit, factor) in enumerate(channels):
+            channel = group.create_group(f"Channel_{number:03}")
+            channel.attrs.update({"channel.name": name.encode(), "channel.fancy-name": fancy.encode()})
+            scaling = {"multiplier": multiplier, "offset": offset, "unit.unit": unit.encode()}
+            channel.attrs.update({f"net-encoder.scaling.{key}": value for key, value in scaling.items()})
+            channel.attrs["retrace"] = str(retrace).lower().encode()
+            heights = relief() if reflect else relief()[::-1]
+            numbers = np.rint((factor * heights * 1e-6 - offset) / multiplier).astype("<i4").ravel()[:pixels]
+            channel["Height" if name == "height" else "Error"] = np.stack([numbers, *(frames - 1) * [0 * numbers]], 1)
+            channel["thumbnail"] = np.zeros((4, 1), "i4")
+    return whole.getvalue()
+
+
+def jpk(lines=ROWS, image="", curves=0, retrace=False):
     """JPK: a TIFF whose first page is a preview, with the size of the grid; channels are on further pages, upwards.
 
     Args:
         lines: of the grid, of which the image has the first ones.
         image: name of this TIFF in an archive of force curves; "" for the TIFF itself.
         curves: bytes of force curves in that archive.
+        retrace: whether twice the heights, as retrace, stand before them.
     """
     import tifffile
 
@@ -240,6 +267,9 @@ def jpk(lines=ROWS, image="", curves=0):
     whole = io.BytesIO()
     with tifffile.TiffWriter(whole) as file:
         file.write(np.zeros((8, 8), "u1"), extratags=first, metadata=None, photometric="minisblack")
+        if retrace:
+            back = [(0x8051, "i", 1, 1, True) if tag[0] == 0x8051 else tag for tag in height]
+            file.write(2 * numbers, extratags=back, metadata=None, photometric="minisblack")
         file.write(numbers, extratags=height, metadata=None, photometric="minisblack")
     if not image:
         return whole.getvalue()

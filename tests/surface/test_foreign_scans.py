@@ -7,7 +7,7 @@ from contextlib import nullcontext
 import foreign_scans
 import numpy as np
 import pytest
-from foreign_scans import COLUMNS, DX, DY, REVISION, ROWS, ibw, jpk, nms, park, sur, tmd, wyko, x3p, zygo
+from foreign_scans import COLUMNS, DX, DY, REVISION, ROWS, h5_jpk, ibw, jpk, nms, park, sur, tmd, wyko, x3p, zygo
 from test_instrument_files import needs_the_extra
 
 from mitsuba_diffraction.files import reading
@@ -328,6 +328,34 @@ def test_a_jpk_image_of_a_part_of_the_grid_has_its_pixels(tmp_path):
     (tmp_path / "stopped.jpk").write_bytes(jpk(lines=2 * ROWS))
     with pytest.warns(UserWarning, match=f"image of {COLUMNS} × {ROWS} pixels, of a grid of {COLUMNS} × {2 * ROWS}"):
         check(tmp_path / "stopped.jpk")
+
+
+@needs_the_extra
+def test_trace_of_jpk_is_read_before_retrace(tmp_path):
+    (tmp_path / "scan.jpk").write_bytes(jpk(retrace=True))
+    check(tmp_path / "scan.jpk")
+    assert read_height_field(tmp_path / "scan.jpk", channel=0).source == "scan.jpk, Height (measured, retrace)"
+
+
+@needs_the_extra
+def test_jpk_in_hdf5_is_read(tmp_path):
+    path = tmp_path / "scan.h5-jpk"
+    for reflect in (False, True):
+        path.write_bytes(h5_jpk(reflect))
+        check(path)
+    assert read_height_field(path).source == "scan.h5-jpk, Height, frame 1 of 2"
+    back = read_height_field(path, channel="retrace")
+    assert back.source == "scan.h5-jpk, Height (retrace), frame 1 of 2"
+    np.testing.assert_allclose(back.heights, 2 * foreign_scans.relief(), atol=1e-5)
+    with pytest.raises(ValueError, match="0 'Error Signal' holds no lengths"):
+        read_height_field(path, channel=0)
+    path.write_bytes(h5_jpk(pixels=ROWS))
+    with pytest.raises(ValueError, match=f"got {ROWS} pixels in 2 frames, wanted {COLUMNS} × {ROWS}"):
+        read_height_field(path)
+    path.write_bytes(h5_jpk()[:3000])
+    with pytest.raises(ValueError, match="a damaged file of JPK, or not one") as caught:
+        read_height_field(path)
+    assert "\n" not in str(caught.value)
 
 
 @needs_the_extra

@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 from ...errors import RequestError, is_number
 from ...files.reading import check_file
 from ..heightfield import HeightField
-from . import gwyddion, images, instruments, interferometers, nanoscope, text, workarounds
+from . import gwyddion, h5_jpk, images, instruments, interferometers, nanoscope, text, workarounds
 from .scan import (
     MAX_FIELD,
     MAX_HEIGHT_RANGE,
@@ -47,7 +47,11 @@ _WITHOUT_UNIT = {
 """Extension → reader of formats with heights in µm, or scaled by `height_range`."""
 
 # Extension → reader of formats with units and several channels.
-_WITH_CHANNELS = {".gwy": gwyddion.read_gwyddion, nanoscope.TEXT: nanoscope.read_text}
+_WITH_CHANNELS = {
+    ".gwy": gwyddion.read_gwyddion,
+    ".h5-jpk": h5_jpk.read_h5_jpk,
+    nanoscope.TEXT: nanoscope.read_text,
+}
 # Extension → reader of single-channel formats with a unit.
 _WITH_UNIT = {
     ".gsf": gwyddion.read_simple_field,

@@ -39,9 +39,9 @@ FORMATS = {f".{name}": name for name in _NAMED_ALIKE.split()} | _NAMED_OTHERWISE
 """Extension → SurfaceTopography's name of the format, in addition to Nanoscope's numbers (.000, .001, …)."""
 
 NAMES = (
-    "Nanoscope .spm .000, Nanosurf .nid .ezd, Park .tiff, Igor .ibw, JPK .jpk .jpk-qi-image .jpk-qi-data, NT-MDT .mdt, "
-    "WSxM .stp .top, ISO 25178-71 .sdf, X3P .x3p, Digital Surf .sur, Zygo .dat .datx, Wyko .opd, Keyence .vk4, "
-    "Sensofar .plu .plux, NanoFocus .nms, TrueMap .tmd and others"
+    "Nanoscope .spm .000, Nanosurf .nid .ezd, Park .tiff, Igor .ibw, JPK .jpk .h5-jpk .jpk-qi-image .jpk-qi-data, "
+    "NT-MDT .mdt, WSxM .stp .top, ISO 25178-71 .sdf, X3P .x3p, Digital Surf .sur, Zygo .dat .datx, Wyko .opd, "
+    "Keyence .vk4, Sensofar .plu .plux, NanoFocus .nms, TrueMap .tmd and others"
 )
 
 

@@ -96,6 +96,7 @@ def decoded(content: bytes) -> str:
 DAMAGED = (SyntaxError, TypeError, KeyError, EOFError, IndexError, OverflowError, struct.error, UserWarning)
 # Names of the height channel in instrument files.
 _HEIGHT_NAMES = ("height", "topograph", "z-axis", "zsensor", "z sensor")
+_RETRACE = ("retrace", "backward")  # in the name of a channel whose lines were scanned on the way back
 
 
 @dataclass(frozen=True)
@@ -136,7 +137,7 @@ def choose_channel(channels: Sequence[Channel], wanted: str | int | None) -> Cha
 
     Args:
         wanted: number, name or unique part of a name (case-insensitive). None selects the only channel of lengths, or
-            the first one named as heights.
+            the first one named as heights, trace before retrace.
     """
     if wanted is None:
         lengths = [channel for channel in channels if channel.is_length]
@@ -145,7 +146,7 @@ def choose_channel(channels: Sequence[Channel], wanted: str | int | None) -> Cha
             raise RequestError(f"wanted a channel of heights in a unit of length, got {_listed(channels)}")
         if not named and len(lengths) > 1:
             raise RequestError(f"channel: which of {_listed(lengths)}?")
-        return (named or lengths)[0]
+        return min(named or lengths, key=lambda channel: any(word in channel.name.lower() for word in _RETRACE))
     if isinstance(wanted, int) and not isinstance(wanted, bool):
         found = [channel for channel in channels if channel.number == wanted]
     elif isinstance(wanted, str):
