@@ -300,6 +300,17 @@ def test_named_columns_of_an_igor_wave_are_curves(tmp_path):
     (tmp_path / "scan.ibw").write_bytes(ibw(column_names=["Raw", "Deflection", *map(str, range(ROWS - 2))]))
     with pytest.raises(ValueError, match=r"wanted a channel of heights .* got 0 'Raw', 1 'Deflection'"):
         read_height_field(tmp_path / "scan.ibw")
+    with pytest.raises(ValueError, match=r"channel: 0 'Raw' is a line, such as a profile"):
+        read_height_field(tmp_path / "scan.ibw", channel="Raw")
+
+
+@needs_the_extra
+def test_a_profile_is_refused_as_a_line(tmp_path):
+    wave = bytearray(ibw())
+    struct.pack_into("<4i", wave, 132, ROWS * COLUMNS, 0, 0, 0)
+    (tmp_path / "scan.ibw").write_bytes(wave)
+    with pytest.raises(ValueError, match=r"in a unit of length, got 0 '.*', which are lines, such as a profile"):
+        read_height_field(tmp_path / "scan.ibw")
 
 
 @needs_the_extra

@@ -67,7 +67,7 @@ def read_instrument(path: Path, unit: str | tuple[str, str] | None, channel: str
             found = {c.index: c for c in library(contents).channels}
             chosen = choose_channel(
                 [
-                    Channel(number, c.name or "untitled", c.dim == 2 and c.data_kind.value == "height")
+                    Channel(number, c.name or "untitled", c.dim == 2 and c.data_kind.value == "height", c.dim == 1)
                     for number, c in found.items()
                 ],
                 channel,

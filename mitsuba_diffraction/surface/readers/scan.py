@@ -122,11 +122,12 @@ class Scan:
 
 @dataclass(frozen=True)
 class Channel:
-    """A channel of a file: its number, its name, and whether it holds lengths."""
+    """A channel of a file: its number, its name, whether it holds lengths of an area, and whether it is a line."""
 
     number: int
     name: str
     is_length: bool
+    is_line: bool = False
 
     def __str__(self) -> str:
         return f"{self.number} {self.name!r}"
@@ -143,7 +144,8 @@ def choose_channel(channels: Sequence[Channel], wanted: str | int | None) -> Cha
         lengths = [channel for channel in channels if channel.is_length]
         named = [c for c in lengths if any(name in c.name.lower() for name in _HEIGHT_NAMES)]
         if not lengths:
-            raise RequestError(f"wanted a channel of heights in a unit of length, got {_listed(channels)}")
+            lines = ", which are lines, such as a profile" if channels and all(c.is_line for c in channels) else ""
+            raise RequestError(f"wanted a channel of heights in a unit of length, got {_listed(channels)}{lines}")
         if not named and len(lengths) > 1:
             raise RequestError(f"channel: which of {_listed(lengths)}?")
         return min(named or lengths, key=lambda channel: any(word in channel.name.lower() for word in _RETRACE))
@@ -159,7 +161,8 @@ def choose_channel(channels: Sequence[Channel], wanted: str | int | None) -> Cha
     if len(found) != 1:
         raise RequestError(f"channel: got {wanted!r}, wanted one of {_listed(found or channels)}")
     if not found[0].is_length:
-        raise RequestError(f"channel: {found[0]} holds no lengths")
+        what = "is a line, such as a profile; wanted heights of an area" if found[0].is_line else "holds no lengths"
+        raise RequestError(f"channel: {found[0]} {what}")
     return found[0]
 
 
