@@ -63,7 +63,7 @@ def test_messages_name_what_is_available(body, parameters, words, tmp_path, llvm
     [
         (
             "compare scenes/xenopeltis_sphere.xml -D light=strip_along_x",
-            "shader knows no other; choose -D light=bulb or -D light=parallel",
+            "shader knows no other; choose -D light=bulb or -D light=parallel or -D light=sun",
         ),
         (
             "compare precompute/measured/scan.npz",
@@ -73,7 +73,10 @@ def test_messages_name_what_is_available(body, parameters, words, tmp_path, llvm
             "compare scenes/blaze.xml -D light=bulb --shader flss --shader stam",
             "shader: got 'stam', wanted one of flss, nmm, pq, nmm_pq, gem",
         ),
-        ("convergence scenes/blaze.xml -o out.png", "shader knows no other; choose -D light=bulb or -D light=parallel"),
+        (
+            "convergence scenes/blaze.xml -o out.png",
+            "shader knows no other; choose -D light=bulb or -D light=parallel or -D light=sun",
+        ),
         ("render scenes/blaze.blend", "got a file of Blender, wanted a scene (.xml), which Mitsuba-Blender exports"),
         ("render moved/scan.xml", "moved/scan.xml: no such file; mitsuba-diffraction examples writes it"),
         ("inspect scan.png --jason a.json", "(try mitsuba-diffraction inspect --help)"),

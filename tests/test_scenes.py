@@ -19,6 +19,7 @@ import mitsuba_diffraction as md
 from mitsuba_diffraction.inverse_design import hologram as gratings_of
 from mitsuba_diffraction.precomputation.recipe import Recipe
 from mitsuba_diffraction.render import render, scene_file
+from mitsuba_diffraction.render.parser_state import children_of
 from mitsuba_diffraction.render.scene_file import SceneFile
 
 ROOT = Path(__file__).parents[1]
@@ -82,14 +83,48 @@ def test_scene_of_transmitted_light_renders(llvm, name, parameters):
     check(render(SceneFile(SCENES / f"{name}.xml", parameters, size=(32, None)), spp=4), 32, 18)
 
 
+ROWS = re.findall(r"^\| (`\w+\.xml`.*?) \|.*?\| (.*) \|$", (SCENES / "README.md").read_text("utf-8"), re.MULTILINE)
+NAMED = {
+    scene: set(re.findall(r"(?<!\w)`(\w+)`", row))
+    for scenes, row in ROWS
+    for scene in re.findall(r"(\w+)\.xml", scenes)
+}
+LIGHTS = sorted(path.stem for path in (SCENES / "lights").glob("*.xml"))
+
+
+@pytest.mark.parametrize("path", sorted(SCENES.glob("*.xml")), ids=lambda path: path.stem)
+def test_the_page_names_the_parameters_of_each_scene_and_every_light_goes_with_it(path, monkeypatch):
+    # Regression: sun, lamp, lamps and desk_lamp had an integrator of their own, which scenes with one refused.
+    monkeypatch.setattr(scene_file, "_make_models", lambda *arguments: None)
+    monkeypatch.setattr(scene_file, "_refuse_missing_files", lambda *arguments: None)
+    defaults = dict(re.findall(r'<default name="(\w+)" value="([^"]*)"', " ".join(path.read_text("utf-8").split())))
+    defaults.pop("denoise", None)  # of the command render alone
+    if path.stem == "scan":
+        defaults["spectrum"] = "skin.toml"
+    assert defaults.keys() <= NAMED[path.stem]
+    for light in LIGHTS if "light" in NAMED[path.stem] and path.stem != "projection" else [""]:
+        given = {name: light if name == "light" and light else value for name, value in defaults.items()}
+        with SceneFile(path, given).parsed() as (_, state):
+            kinds = [state.nodes[k].type for k in children_of(state, state.root.props).values()]
+        assert kinds.count(mi.ObjectType.Integrator) == kinds.count(mi.ObjectType.Sensor) == 1, light
+
+
 @pytest.mark.slow
-def test_scene_of_a_scan_renders(llvm, tmp_path):
-    path = tmp_path / "spectrum.exr"
+@pytest.mark.parametrize("name", ["scan", "elaphe", "xenopeltis_sphere", "screen"])
+def test_scene_of_a_scan_renders(llvm, tmp_path, name):
+    """By its recipe, and by a saved spectrum where the scene requests nothing of it."""
+    path, recipe = tmp_path / "spectrum.exr", tmp_path / "skin.toml"
     md.precompute(md.gratings.elaphe_synthetic(8)).save(path)
-    recipe = tmp_path / "skin.toml"
     recipe.write_text('[surface]\nprofile = "elaphe_synthetic"\nsize = 8.0\n')
-    for name, parameters in (("scan", {"spectrum": str(path)}), ("elaphe", {"skin": str(recipe)})):
-        check(render(SceneFile(SCENES / f"{name}.xml", parameters, size=(16, 16)), spp=4), 16, 16)
+    for surface in (recipe, path):
+        scene = SceneFile(
+            SCENES / f"{name}.xml", {"spectrum" if name == "scan" else "skin": str(surface)}, size=(16, 16)
+        )
+        if name == "xenopeltis_sphere" and surface is path:
+            with pytest.raises(ValueError, match=r"tolerance: got 0.01 with .*spectrum.exr, wanted .* or a recipe"):
+                render(scene, spp=4)
+        else:
+            check(render(scene, spp=4), 16, 16)
 
 
 ON_ONE_CORE = """

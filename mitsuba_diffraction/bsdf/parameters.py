@@ -24,6 +24,7 @@ from ..rigorous.rigorous_spectrum import RigorousSpectrum
 from ..settings import (
     FROM_RADIUS,
     MIN_WAVELENGTH,
+    SPECTRUM_PARAMETERS,
     THEORIES,
     TRANSMISSIONS,
     VISIBLE,
@@ -265,9 +266,12 @@ def _requested(props: mi.Properties) -> dict[str, Any]:
 
 
 def _refuse_requested(props: mi.Properties, of: str) -> None:
-    """Check that nothing is requested of a spectrum that is computed already."""
+    """Check that nothing but a default is requested of a spectrum that is computed already."""
     for name, value in _requested(props).items():
-        raise RequestError(f"{name}: got {value} with {of}, wanted it when the spectrum is computed")
+        if value not in ("auto", SPECTRUM_PARAMETERS[name].default):
+            raise RequestError(
+                f"{name}: got {value} with {of}, wanted it when the spectrum is computed, or a recipe (.toml)"
+            )
 
 
 def _inside(media: Media, scale: float, recipe: Recipe) -> Recipe:

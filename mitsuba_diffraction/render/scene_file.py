@@ -243,7 +243,8 @@ def _alternatives(scene: Path, error: str, parameters: Mapping[str, str]) -> str
     if (missing := re.search(r'Plugin "(\w+)" not found', error)) is not None:
         return did_you_mean(missing[1], _PLUGINS)
     if "unused parameters" in error:
-        return f"; the scene's parameters are {', '.join(sorted(_parameters_of(scene))) or 'none'}"
+        others = _parameters_of(scene) - set(re.findall(r"\$(\w+)=", error))
+        return f"; the scene's parameters are {', '.join(sorted(others)) or 'none'}"
     return ""
 
 

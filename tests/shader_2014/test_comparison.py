@@ -440,7 +440,7 @@ def test_the_same_seed_gives_the_same_numbers(llvm, folder):
 
 def test_lights_that_the_shader_supports_are_found():
     scene = Path(__file__).parents[2] / "scenes" / "xenopeltis_sphere.xml"
-    assert supported_lights(SceneFile(scene)) == ("bulb", "parallel")
+    assert supported_lights(SceneFile(scene)) == ("bulb", "parallel", "sun")
     assert supported_lights(SceneFile(scene, {"light": "bulb"})) is None
 
 
@@ -450,7 +450,7 @@ def test_a_recipe_is_compared_on_the_objects_of_a_scene(command, llvm, folder):
     Path("skin.toml").write_text(recipe)
     code, _, err = command("compare skin.toml --shader gem --spp 2 --width 12 --no-shares")
     assert code == 0, err
-    assert "note: the shader does not know the lights of scan.xml: light=parallel, of bulb, parallel" in err
+    assert "note: the shader does not know the lights of scan.xml: light=parallel, of bulb, parallel, sun" in err
     assert names() == {"skin.toml", "skin-gem.png", *(f"skin-gem-{p}.exr" for p in ("path", "published", "corrected"))}
 
 

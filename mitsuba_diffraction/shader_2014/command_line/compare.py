@@ -70,8 +70,8 @@ def compare(
         parameters = {"spectrum": str(scene.resolve()), **parameters}
         scene = examples_folder() / "scenes" / "scan.xml"
     if "light" not in parameters and (lights := supported_lights(SceneFile(scene, parameters))):
-        parameters["light"] = lights[-1]
-        say("note", f"the shader does not know the lights of {scene.name}: light={lights[-1]}, of {', '.join(lights)}")
+        light = parameters["light"] = "parallel" if "parallel" in lights else lights[-1]
+        say("note", f"the shader does not know the lights of {scene.name}: light={light}, of {', '.join(lights)}")
     reads = SceneFile(scene, parameters).files()
     prefix = output
     if output is None or output.is_dir():

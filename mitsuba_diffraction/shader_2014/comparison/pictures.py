@@ -451,12 +451,7 @@ def supported_lights(scene_file: SceneFile) -> tuple[str, ...] | None:
     if "lights/$light.xml" not in text:
         return ()
     lights = {path.stem: path.read_text("utf-8") for path in sorted((scene.parent / "lights").glob("*.xml"))}
-    return tuple(
-        name
-        for name, light in lights.items()
-        if re.search(r'<emitter type="(directional|point)"', light)
-        and ("<integrator" in light) != ("<integrator" in text)
-    )
+    return tuple(name for name, light in lights.items() if re.search(r'<emitter type="(directional|point)"', light))
 
 
 def _check_lights(scene_file: SceneFile) -> None:
