@@ -17,7 +17,8 @@ from ..handed_over_spectra import handed_over
 from ..optics.geometry import SHADOWING
 from ..optics.materials import KnownRange, RefractiveIndex, is_file
 from ..optics.media import DEFAULT_INT_IOR, MediumBelow
-from ..precomputation.recipe import REQUESTED, Recipe, source_named
+from ..precomputation.recipe import REQUESTED, Recipe, kind_of, source_named
+from ..precomputation.requested_surface import RequestedSurface
 from ..precomputation.spectra import Spectrum, load_spectrum
 from ..rigorous.build_table import medium_below
 from ..rigorous.rigorous_spectrum import RigorousSpectrum
@@ -308,15 +309,15 @@ def _from_file(props: mi.Properties, media: Media, scale: float) -> Spectrum | R
     given = _requested(props)
     if not path.suffix:
         path = Path(source_named(str(path)))
-    suffix = path.suffix.lower()
-    if suffix in (".toml", ".exr") and not path.is_file():
+    kind = kind_of(path)
+    if kind in ("recipe", "spectrum") and not path.is_file():
         # An unresolved path is relative; the resolver begins with the folder of the scene.
         folder = Path(str(mi.file_resolver()[0])) / path.parent
-        available = sorted(other.name for other in folder.glob("*") if other.suffix.lower() in (".exr", ".toml"))
+        available = sorted(other.name for other in folder.glob("*") if kind_of(other) in ("recipe", "spectrum"))
         raise FileNotFoundError(f"{path}: no such file; {folder} holds {', '.join(available) or 'no spectrum'}")
-    if suffix == ".toml" or str(path) in PROFILES:
-        return _inside(media, scale, Recipe.of_source(str(path), given))
-    if suffix == ".exr":
+    if kind in ("recipe", "profile"):
+        return _inside(media, scale, RequestedSurface.named(str(path), given).recipe)
+    if kind == "spectrum":
         _refuse_requested(props, str(path))
         return load_spectrum(path)
     raise RequestError(

@@ -26,7 +26,6 @@ from .design import design
 from .efficiency import efficiency
 from .examples import examples
 from .export import export
-from .former_options import Given, add_options, surface_argument, take_options
 from .hologram import hologram
 from .inspect import inspect
 from .precompute import precompute
@@ -38,25 +37,14 @@ _UsageError: Any = typer.BadParameter.__base__
 
 
 class _Command(TyperCommand):
-    """Command that refuses an option given twice, unless it takes a list of values, and takes former options."""
+    """Command that refuses an option given twice, unless it takes a list of values."""
 
     def parse_args(self, context: Any, arguments: list[str]) -> list[str]:
-        former: Given = []
-        if surface_argument(self) is not None and not context.resilient_parsing:
-            arguments, former = take_options(self, arguments)
         _, _, order = self.make_parser(context).parse_args(list(arguments))
         for parameter in order:
             if order.count(parameter) > 1 and not parameter.multiple and parameter.param_type_name == "option":
                 raise RequestError(f"{parameter.opts[-1]}: got it twice, wanted one value")
-        rest = super().parse_args(context, arguments)
-        context.meta[NAME] = add_options(self, context, former) if former else ""
-        return rest
-
-    def invoke(self, context: Any) -> Any:
-        result = super().invoke(context)
-        if note := context.meta[NAME]:  # afterwards, so that a refusal remains one line
-            say("note", note)
-        return result
+        return super().parse_args(context, arguments)
 
 
 app = typer.Typer()

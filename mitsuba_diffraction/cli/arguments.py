@@ -14,10 +14,9 @@ from numpy.typing import NDArray
 
 from ..errors import RequestError
 from ..files.writing import refuse_other_than_utf8
-from ..precomputation.recipe import Recipe
-from ..precomputation.surface_text import absolute, parsed
+from ..precomputation.requested_surface import RequestedSurface
+from ..precomputation.surface_text import absolute
 from ..progress import say
-from ..surface.gratings import PROFILES
 
 _MAX_VALUES = 10_000  # of a range first:last:step
 
@@ -92,41 +91,22 @@ def materials_of(texts: Sequence[str] | None) -> dict[str, dict[str, Any]]:
         name, equals, rest = text.partition("=")
         if not (name and equals and rest.partition(",")[0]):
             raise RequestError(f"--material: got {text!r}, wanted ID=SURFACE[,name=value…]")
-        source, values = parsed(rest)
+        requested = RequestedSurface.of(rest)
+        source, values = requested.source, dict(requested.values)
         if name in materials:
             raise RequestError(f"--material {name}: got it twice, wanted one grating")
-        is_file = Path(source).suffix.lower() in (".toml", ".exr")
-        if source not in PROFILES and not is_file:
+        if requested.kind == "scan":
             raise RequestError(
                 f"--material {name}: got {source}, wanted a recipe (.toml), a spectrum (.exr) or a profile"
             )
+        is_file = requested.kind != "profile"
         if lists := [key for key, value in values.items() if isinstance(value, list)]:
             raise RequestError(f"--material {name}: got a list, {lists[0]}, which a recipe has, but no scene")
         if is_file and not os.path.isfile(source):
             raise FileNotFoundError(f"{source}: no such file")
-        if is_film(source) and values.keys().isdisjoint(("transmission", "material", "coat_ior", "base")):
+        if requested.is_film and values.keys().isdisjoint(("transmission", "material", "coat_ior", "base")):
             values["transmission"] = "sheet"
             say("note", f"material {name}: {source} transmits light (transmission=sheet); transmission=none does not")
         # Absolute, as file names in a scene are relative to the folder of the scene.
         materials[name] = {**({"filename": os.path.abspath(source)} if is_file else {"profile": source}), **values}
     return materials
-
-
-def is_film(source: str) -> bool:
-    """Return whether a profile, or the profile of a recipe, is a transparent film."""
-    profile = Recipe.load(source).surface.get("profile", "") if source.lower().endswith(".toml") else source
-    return profile == "film" or profile.startswith("transmission_")
-
-
-def recipe_of(source: str, values: Mapping[str, Any]) -> Recipe | None:
-    """Return the recipe of a surface as `surface_text.parsed` returns it; None for a saved spectrum.
-
-    Raises:
-        RequestError: if a value is wrong, or is given with a saved spectrum (.exr).
-    """
-    if Path(source).suffix.lower() != ".exr":
-        return Recipe.of_source(source, values)
-    if values:
-        got = ", ".join(values)
-        raise RequestError(f"{source}: got {got} with a saved spectrum, wanted the recipe or the scan itself")
-    return None

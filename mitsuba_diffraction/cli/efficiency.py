@@ -14,8 +14,7 @@ from ..files.outputs import check_outputs
 from ..inspection.efficiency import OrderEfficiencies, order_efficiencies
 from ..inspection.peaks import check_request, efficiencies_of_peaks
 from ..precomputation.grating_spectrum import GratingSpectrum
-from ..precomputation.spectra import load_spectrum
-from ..precomputation.surface_text import parsed
+from ..precomputation.requested_surface import RequestedSurface
 from ..progress import progress_bar, tell
 from ..scalar_theory.validity import scalar_error
 from ..settings import ScalarSettings
@@ -27,7 +26,6 @@ from .arguments import (
     check_suffix,
     named_as_options,
     parse_numbers,
-    recipe_of,
 )
 
 _OF_LIGHT = ("theory", "transmission", "material", "int_ior", "ext_ior")  # besides the surface
@@ -57,40 +55,37 @@ def efficiency(
 ) -> None:
     """Compute how much light goes into each order of a grating, or each spectral peak of an irregular surface."""
     angles, wavelengths = angles_of("--angle", angle), parse_numbers("--wavelength", wavelength)
-    name, values = parsed(surface)
-    given = {key: values.pop(key) for key in _OF_LIGHT if key in values}
-    # The names of rigorous theory are known to its recipes alone.
-    of_theory = {"theory": "rigorous"} if given.get("theory") == "rigorous" else {}
-    recipe = recipe_of(name, values | of_theory)
-    settings = ScalarSettings() if recipe is None else recipe.settings
-    chosen = {"theory": "scalar", "transmission": "none", **settings.chosen}
-    theory, transmission = (given.get(key, chosen[key]) for key in _OF_LIGHT[:2])
-    below = medium_in_air(chosen, given)
+    requested = RequestedSurface.of(surface, aside=_OF_LIGHT)
+    name, theory = requested.title, requested.theory
+    settings = ScalarSettings() if requested.is_spectrum else requested.stated.settings
+    transmission = requested.aside.get("transmission", settings.chosen.get("transmission", "none"))
+    below = medium_in_air(settings.chosen, requested.aside)
     if csv is not None:
         check_suffix("--csv", csv, ".csv")
     if plot is not None:
         check_suffix("--plot", plot, ".png", ".pdf", ".svg")
     writes = [(option, path) for option, path in (("--csv", csv), ("--plot", plot)) if path is not None]
-    check_outputs([Path(name), *(recipe.files if recipe else [])], writes, overwrite=overwrite)
-    irregular = recipe is None or settings.extent == "sample" or recipe.patches > 1
-    if irregular and (theory, transmission) != ("scalar", "none"):
+    check_outputs(requested.files, writes, overwrite=overwrite)
+    if (irregular := requested.is_irregular) and (theory, transmission) != ("scalar", "none"):
+        what, other = ("a saved spectrum", ", or its recipe") if requested.is_spectrum else ("an irregular surface", "")
         raise RequestError(
-            f"{name}: got theory {theory}, transmission {transmission} of an irregular surface, wanted scalar, none"
+            f"{name}: got theory {theory}, transmission {transmission} of {what}, wanted scalar, none{other}"
         )
+    requested.say_extent()
     light = angles, wavelengths, azimuth
     found: OrderEfficiencies
-    if recipe is None or irregular:
+    if irregular:
         check_request(settings.wavelengths, angles, wavelengths, below)  # before a spectrum is computed
-        cached = load_spectrum(name) if recipe is None else recipe.cached(partial(progress_bar, unit="%"))
-        if not isinstance(cached, GratingSpectrum):
-            raise RequestError(f"{name}: got a spectrum of rigorous theory, wanted its recipe")
+        cached = requested.spectrum(partial(progress_bar, unit="%"))
+        assert isinstance(cached, GratingSpectrum)
         with progress_bar(f"peaks of {name}") as progress:
             found = efficiencies_of_peaks(cached, below, *light, progress)
         warning = cached.warning
     else:
+        field = requested.recipe.height_field()
         with progress_bar(f"efficiencies of {name}") as progress:
-            found = order_efficiencies(recipe.height_field(), below, *light, theory, transmission, progress)
-            warning = scalar_error(recipe.height_field(), below=below).warning if theory == "scalar" else ""
+            found = order_efficiencies(field, below, *light, theory, transmission, progress)
+            warning = scalar_error(field, below=below).warning if theory == "scalar" else ""
     tell(str(found))
     if warning:
         tell(f"! {warning}")

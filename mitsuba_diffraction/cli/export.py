@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from functools import partial
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated
 
 import typer
 
@@ -15,9 +15,7 @@ from ..export.lswm import write_lswm
 from ..export.order_table import write_order_table
 from ..files.outputs import check_outputs
 from ..precomputation.grating_spectrum import GratingSpectrum
-from ..precomputation.recipe import Recipe, theory_in
-from ..precomputation.spectra import load_spectrum
-from ..precomputation.surface_text import parsed
+from ..precomputation.requested_surface import RequestedSurface
 from ..progress import progress_bar, say, tell
 from ..scalar_theory.validity import scalar_error
 from .arguments import (
@@ -26,10 +24,8 @@ from .arguments import (
     Overwrite,
     angles_of,
     check_suffix,
-    is_film,
     named_as_options,
     parse_numbers,
-    recipe_of,
 )
 
 _OPTIONS = {"wavelengths": "--wavelength", "azimuths": "--azimuth"}
@@ -73,62 +69,61 @@ def export(
     overwrite: Overwrite = False,
 ) -> None:
     """Write a surface for another program."""
-    name, values = parsed(surface)
+    requested = RequestedSurface.of(surface, aside=(*_OF_MATERIAL, *_IN_SCENES))
     check_suffix("-o", output, ".osl", *_RANGES)
     ranges = {"wavelength": wavelength, "angle": angle, "azimuth": azimuth}
     given = {key: text for key, text in ranges.items() if text is not None}
-    parameters = {key: values.pop(key) for key in _OF_MATERIAL if key in values}
-    _refuse_parameters_of_scenes(values, output)
-    # A recipe of the package keeps its name.
-    title = name if surface.startswith(name) else surface.partition(",")[0]
-    recipe = recipe_of(name, values)
-    check_outputs([Path(name), *(recipe.files if recipe else [])], [("-o", output)], overwrite=overwrite)
+    _refuse_parameters_of_scenes(requested, output)
+    check_outputs(requested.files, [("-o", output)], overwrite=overwrite)
     if output.suffix.lower() == ".osl":
         if given:
             raise RequestError(f"--{', --'.join(given)}: {output} holds all directions and colours, wanted it without")
-        _write_shader(title, recipe, parameters, output)
-    elif recipe is None:
-        raise RequestError(f"{name}: got a saved spectrum for {output}, wanted the recipe, the profile or the scan")
+        _write_shader(requested, output)
+    elif requested.is_spectrum:
+        raise RequestError(f"{surface}: got a saved spectrum for {output}, wanted the recipe, the profile or the scan")
     else:
-        _write_orders(title, recipe, parameters, output, given)
+        _write_orders(requested, output, given)
 
 
-def _refuse_parameters_of_scenes(values: dict[str, Any], output: Path) -> None:
+def _refuse_parameters_of_scenes(requested: RequestedSurface, output: Path) -> None:
     """Refuse parameters of the plugin that files for other programs do not hold, and say what does."""
     is_shader = output.suffix.lower() == ".osl"
     for key in _IN_SCENES:
-        if key in values:
+        if key in requested.aside:
             instead = f"set the input {_INPUTS[key]} of the shader" if is_shader and key in _INPUTS else ""
             instead = instead or "wanted it without; scenes and `render --material` have it"
-            raise RequestError(f"{key}: got {values[key]}, which {output} does not hold; {instead}")
+            raise RequestError(f"{key}: got {requested.aside[key]}, which {output} does not hold; {instead}")
 
 
-def _write_shader(title: str, recipe: Recipe | None, parameters: dict[str, Any], output: Path) -> None:
-    theory = parameters.pop("theory", recipe.settings.theory if recipe else theory_in(Path(title)))
-    if theory != "scalar":
+def _write_shader(requested: RequestedSurface, output: Path) -> None:
+    title = requested.title
+    if requested.theory != "scalar":
         raise RequestError(
-            f"{title}: got theory={theory}, and a shader for Cycles holds scalar theory: wanted theory=scalar, or a "
-            "file .csv or .json"
+            f"{title}: got theory={requested.theory}, and a shader for Cycles holds scalar theory: wanted "
+            "theory=scalar, or a file .csv or .json"
         )
+    requested.say_extent()
     progress = partial(progress_bar, unit="%")
-    spectrum = load_spectrum(title) if recipe is None else shader_recipe(recipe).cached(progress)
+    saved = requested.is_spectrum
+    spectrum = requested.spectrum() if saved else shader_recipe(requested.recipe).cached(progress)
     assert isinstance(spectrum, GratingSpectrum)
-    chosen = recipe.settings.chosen if recipe else {}
-    if is_film(title) or chosen.get("transmission", "none") != "none":
+    chosen = {} if saved else requested.recipe.settings.chosen
+    if requested.is_film or chosen.get("transmission", "none") != "none":
         say("note", f"{title}: the shader shows the light that it reflects; `render` shows what it transmits")
-    held = write_shader(spectrum, output, medium_in_air(chosen, parameters))
+    held = write_shader(spectrum, output, medium_in_air(chosen, requested.aside))
     if spectrum.warning:
         tell(f"! {spectrum.warning}")
     tell(f"{output}: {spectrum.source}; {held}")
 
 
-def _write_orders(title: str, recipe: Recipe, parameters: dict[str, Any], output: Path, given: dict[str, str]) -> None:
+def _write_orders(requested: RequestedSurface, output: Path, given: dict[str, str]) -> None:
     suffix = output.suffix.lower()
     ranges = _RANGES[suffix] | given
     wavelengths, angles = parse_numbers("--wavelength", ranges["wavelength"]), angles_of("--angle", ranges["angle"])
     azimuths = parse_numbers("--azimuth", ranges["azimuth"])
-    grating = ExportedGrating.of_recipe(recipe, title, parameters, float(wavelengths.min()) * 1e-3)
-    with named_as_options(_OPTIONS), progress_bar(f"orders of {title}") as progress:
+    grating = ExportedGrating.of_surface(requested, float(wavelengths.min()) * 1e-3)
+    requested.say_extent()
+    with named_as_options(_OPTIONS), progress_bar(f"orders of {requested.title}") as progress:
         if suffix == ".csv":
             rows = write_order_table(grating, output, wavelengths, angles, azimuths, progress)
             what = f"{rows:,} rows"

@@ -17,8 +17,7 @@ from ..files.outputs import check_outputs, free_name, plain, save_json
 from ..inspection import Inspection, save_picture
 from ..inspection import inspect as look
 from ..inspection.predicted_colours import GREEN, Colour, colours_at
-from ..precomputation.recipe import Recipe
-from ..precomputation.surface_text import parsed
+from ..precomputation.requested_surface import RequestedSurface
 from ..progress import progress_bar, show, table, tell
 from ..settings import SUN_COHERENCE_LENGTH, lobe_width
 from .arguments import KEYS_OF_RECIPES, SURFACE, Overwrite, angles_of, check_suffix
@@ -40,22 +39,27 @@ def inspect(
         typer.Option(help="print the colours at these angles, degrees, positive on the side opposite to the light"),
     ] = None,
     json: Annotated[Path | None, typer.Option(help="save the numbers (.json)")] = None,
+    pixel_size: Annotated[float | None, typer.Option(help="of a scan, µm; the same as pixel_size=… of SURFACE")] = None,
+    height_range: Annotated[
+        float | None, typer.Option(help="from black to white of a picture, µm; the same as height_range=…")
+    ] = None,
     overwrite: Overwrite = False,
 ) -> None:
     """Report and plot the statistics, periods and predicted colours of a surface, and how reliable they are."""
     angles, views = angles_of("--angle", angle), np.zeros(0) if view is None else angles_of("--view", view)
     if view is None and angle != "0":
         raise RequestError(f"--angle: got {angle} without --view, wanted the angles of the viewer, too")
-    name, values = parsed(surface)
-    source, recipe = Path(name), Recipe.of_source(name, values)
-    reads = [source, *recipe.files]
+    requested = RequestedSurface.of(surface, options={"pixel_size": pixel_size, "height_range": height_range})
+    source, reads = requested.path, requested.files
     default_name = free_name(f"{source.stem}_inspect", lambda stem: [Path(f"{stem}.png")], reads)
     picture = output or Path(f"{default_name}.png")
     check_suffix("-o", picture, ".png", ".pdf", ".svg")
     check_outputs(reads, [("-o", picture), *([("--json", json)] if json else [])], overwrite=overwrite)
+    recipe = requested.recipe
     height_field = recipe.height_field()
     if height_field.heights.size == 1:
         raise RequestError(f"{source}: got a surface of 1 × 1 pixel, wanted more: one height has no spectrum")
+    requested.say_extent()
     with progress_bar(f"inspection of {source.name}", "%") as progress:
         inspection = look(
             height_field,
@@ -65,7 +69,7 @@ def inspect(
             progress=progress,
         )
     colours = colours_at(inspection.spectrum, inspection.direction, angles, views)
-    save_picture(inspection, picture, title=source.stem if source.suffix == ".toml" else source.name)
+    save_picture(inspection, picture, title=source.stem if requested.kind == "recipe" else source.name)
     if json is not None:
         save_json({**inspection.as_json(), **({"colours": plain(colours)} if colours else {})}, json)
     tables = [_table(inspection)]

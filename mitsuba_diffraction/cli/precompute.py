@@ -10,10 +10,10 @@ import typer
 from ..errors import RequestError, is_number
 from ..files.outputs import check_outputs
 from ..precomputation.recipe import Recipe
+from ..precomputation.requested_surface import RequestedSurface
 from ..precomputation.spectra import check_material
-from ..precomputation.surface_text import parsed
+from ..precomputation.surface_text import converted
 from ..progress import bytes_text, durations, progress_bar, stage, tell
-from ..surface.prepare import is_seam_visible, seam_steps
 from .arguments import KEYS_OF_RECIPES, SURFACE, Overwrite, check_suffix
 
 
@@ -29,29 +29,38 @@ def precompute(
     verbose: Annotated[
         bool, typer.Option("--verbose", help="print the steps of preparation, the grid, and what is truncated, too")
     ] = False,
+    representation: Annotated[
+        str | None, typer.Option(help="slices, or a series of the amplitude: taylor, chebyshev")
+    ] = None,
+    terms: Annotated[str | None, typer.Option(help="of a series: a number, or auto, as the tolerance requires")] = None,
+    heights_from: Annotated[str | None, typer.Option(help="level of h = 0 in a series: mean, lowest")] = None,
+    tolerance: Annotated[float | None, typer.Option(help="bound of the error, a fraction of the light")] = None,
+    coherence_length: Annotated[float | None, typer.Option(help="µm")] = None,
     overwrite: Overwrite = False,
 ) -> None:
     """Compute the power spectrum of the phase from recipes, profiles or scans."""
-    requests = [parsed(text) for text in surfaces]
-    sources = [Path(source) for source, _ in requests]
-    if output is not None and len(sources) > 1:
-        raise RequestError(f"-o: got {len(sources)} sources, wanted one (without -o each is named after its source)")
-    targets = [output or Path(source.name or "spectrum").with_suffix(".exr") for source in sources]
+    options = {
+        "representation": representation,
+        "terms": None if terms is None else converted(terms),
+        "heights_from": heights_from,
+        "tolerance": tolerance,
+        "coherence_length": coherence_length,
+    }
+    requests = [RequestedSurface.of(text, options=options) for text in surfaces]
+    if output is not None and len(requests) > 1:
+        raise RequestError(f"-o: got {len(requests)} sources, wanted one (without -o each is named after its source)")
+    targets = [output or Path(request.path.name or "spectrum").with_suffix(".exr") for request in requests]
     for target in targets:
         check_suffix("-o", target, ".exr")
-    recipes = [Recipe.of_source(source, values, "tile") for source, values in requests]
-    for recipe in recipes:
-        _check_pixel_size(recipe)
-    reads = [*sources, *(file for recipe in recipes for file in recipe.files)]
-    writes = [("-o" if output else f"spectrum of {s}", t) for s, t in zip(sources, targets, strict=True)]
+    for request in requests:
+        _check_pixel_size(request.stated)
+    reads = [file for request in requests for file in request.files]
+    writes = [("-o" if output else f"spectrum of {r.path}", t) for r, t in zip(requests, targets, strict=True)]
     check_outputs(reads, writes, overwrite=overwrite)
     with durations():
-        seams = [
-            "" if "extent" in values else _seam(source, recipe)
-            for source, (_, values), recipe in zip(sources, requests, recipes, strict=True)
-        ]
-        for source, recipe, target, seam in zip(sources, recipes, targets, seams, strict=True):
-            _precompute(source, recipe, target, seam, verbose)
+        for request, target in zip(requests, targets, strict=True):
+            request.say_extent()
+            _precompute(request, target, verbose)
 
 
 def _check_pixel_size(recipe: Recipe) -> None:
@@ -64,43 +73,17 @@ def _check_pixel_size(recipe: Recipe) -> None:
         )
 
 
-def _precompute(source: Path, recipe: Recipe, target: Path, seam: str, verbose: bool) -> None:
+def _precompute(request: RequestedSurface, target: Path, verbose: bool) -> None:
     """Compute, save and report one spectrum."""
+    recipe = request.recipe
     check_material(recipe.settings)
-    with progress_bar(f"spectrum of {source.name}", "%") as progress:
+    with progress_bar(f"spectrum of {request.path.name}", "%") as progress:
         spectrum = recipe.build(progress)
         with stage("writing"):
             spectrum.save(target)
-    tell(f"{target}: {recipe.summary()}; {spectrum.summary}; {bytes_text(1e6 * spectrum.megabytes)}{seam}")
+    tell(f"{target}: {recipe.summary()}; {spectrum.summary}; {bytes_text(1e6 * spectrum.megabytes)}")
     if verbose:
         coherence_length = f"coherence length {spectrum.coherence_length:.4g} µm"
         tell(f"{spectrum.source}\n{spectrum.extent}, {spectrum.grid}; {coherence_length}\n{spectrum.details}")
     for concern in spectrum.concerns:
         tell(f"! {concern}")
-
-
-def _seam(source: Path, recipe: Recipe) -> str:
-    """Return a line on the seam of a scan that is repeated as a tile; "" for another surface.
-
-    Raises:
-        ValueError: if the seam would be visible.
-    """
-    if "scan" not in recipe.surface or source.suffix.lower() == ".toml":
-        return ""
-    steps = seam_steps(recipe.height_field())
-    seam = " and ".join(
-        f"{across * 1e3:.3g} nm along {axis} ({inside * 1e3:.3g} inside)" for axis, (across, inside) in steps.items()
-    )
-    if is_seam_visible(steps):
-        ways = [
-            "extent=sample (a sample of an irregular surface)",
-            "extent=tile (periodic, in spite of the seam)",
-            "prepare=crop_periods (a grating, cropped to whole periods)",
-        ]
-        if any("crop_periods" in step for step in recipe.surface.get("prepare", ())):
-            ways.pop()
-        raise RequestError(
-            f"extent: got none, and {source} does not tile without a seam: r.m.s. steps of {seam}; wanted "
-            f"{', '.join(ways[:-1])} or {ways[-1]}"
-        )
-    return f"\nrepeated as a tile; r.m.s. steps at the seam {seam}" if seam else ""

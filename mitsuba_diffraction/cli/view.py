@@ -12,11 +12,12 @@ import typer
 
 from ..files.outputs import check_outputs
 from ..files.writing import whole_file
-from ..precomputation.surface_text import parsed, written
+from ..precomputation.requested_surface import RequestedSurface
+from ..precomputation.surface_text import written
 from ..progress import bytes_text, progress_bar, say, tell
 from ..viewer.page import page, reference_picture
-from ..viewer.viewed_surface import Surface
-from .arguments import KEYS_OF_RECIPES, SURFACE, Overwrite, check_suffix, is_film
+from ..viewer.viewed_surface import OF_SCENE, Surface
+from .arguments import KEYS_OF_RECIPES, SURFACE, Overwrite, check_suffix
 
 
 def view(
@@ -38,21 +39,24 @@ def view(
     overwrite: Overwrite = False,
 ) -> None:
     """Write a page that shades surfaces live in the browser (WebGL2), without network."""
-    requests = [parsed(source) for source in sources]
-    stem = Path(requests[0][0]).stem or "view"
+    requests = [RequestedSurface.of(source, aside=OF_SCENE) for source in sources]
+    stem = requests[0].path.stem or "view"
     target = output or Path(stem if len(requests) == 1 else "surfaces").with_suffix(".html")
     check_suffix("-o", target, ".html")
-    reads = [file for file in (*(Path(name) for name, _ in requests), reference) if file is not None and file.exists()]
+    reads = [*(file for request in requests for file in request.files), *([] if reference is None else [reference])]
     check_outputs(reads, [("-o", target)], overwrite=overwrite)
     picture = None if reference is None else reference_picture(reference)
-    for name, _ in requests:
-        if is_film(name):
+    for request in requests:
+        if request.is_film:
             shown = "the page shows the light that it reflects; `render` shows the light that a film transmits"
-            say("note", f"{name}: {shown}")
+            say("note", f"{request.title}: {shown}")
     progress = functools.partial(progress_bar, unit="%")
-    surfaces = [Surface.named(name, values, progress) for name, values in requests]
+    surfaces = [Surface.requested(request, progress) for request in requests]
+    for request in requests:
+        request.say_extent()
     stems = [one.name for one in surfaces]
-    for index, (_, values) in enumerate(requests):
+    for index, request in enumerate(requests):
+        values = {**request.values, **request.aside}
         if values and stems.count(stems[index]) > 1:  # as of two periods, or materials, of one profile
             surfaces[index] = replace(surfaces[index], name=written(stems[index], values))
     text = page(*surfaces, picture=picture)

@@ -16,7 +16,7 @@ from ..inspection.efficiency import checked_numbers, description
 from ..inspection.order_solver import IncidentLight, OrderSolver, order_solver
 from ..optics.geometry import Orders
 from ..optics.media import MediumBelow
-from ..precomputation.recipe import Recipe
+from ..precomputation.requested_surface import RequestedSurface
 from ..rigorous.coordinate_transformation import is_profile
 from ..settings import THEORIES
 from ..surface.heightfield import HeightField
@@ -74,32 +74,22 @@ class ExportedGrating:
         self.below.at(self.shortest)
 
     @classmethod
-    def of_recipe(cls, recipe: Recipe, name: str, parameters: Mapping[str, Any], shortest: float) -> ExportedGrating:
-        """Return the grating of a recipe.
-
-        Args:
-            recipe: of the surface.
-            name: of it, for messages.
-            parameters: theory, material and int_ior, in the place of those of the recipe.
-            shortest: as the attribute.
+    def of_surface(cls, requested: RequestedSurface, shortest: float) -> ExportedGrating:
+        """Return a requested grating; theory, material and int_ior may stand aside, in the place of its recipe's.
 
         Raises:
             ValueError: if the surface is not periodic, or as the class.
         """
-        if recipe.settings.extent == "sample" or recipe.patches > 1:
+        recipe = requested.recipe
+        if requested.is_irregular:
             raise RequestError(
-                f"{name}: got an irregular surface, which has no orders, wanted a grating; the command `efficiency "
-                "--csv` tabulates its peaks, and a file .osl holds its spectrum"
+                f"{requested.title}: got an irregular surface, which has no orders, wanted a grating; the command "
+                "`efficiency --csv` tabulates its peaks, and a file .osl holds its spectrum"
             )
         field = recipe.height_field()
         if is_profile(field):
             field = HeightField(field.heights[:1], field.pixel_size, field.source)
-        return cls(
-            field,
-            parameters.get("theory", recipe.settings.theory),
-            medium_in_air(recipe.settings.chosen, parameters),
-            shortest,
-        )
+        return cls(field, requested.theory, medium_in_air(recipe.settings.chosen, requested.aside), shortest)
 
     @property
     def description(self) -> str:

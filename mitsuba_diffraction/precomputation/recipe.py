@@ -43,7 +43,7 @@ import warnings
 import weakref
 from collections.abc import Callable, Mapping
 from contextlib import AbstractContextManager, suppress
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 from pathlib import Path
 from typing import Any
@@ -108,6 +108,13 @@ def source_named(name: str) -> str:
     return str(recipes[name])
 
 
+def kind_of(source: str | os.PathLike[str]) -> str:
+    """Return what a source of a surface is, by its name: "profile", "recipe", "spectrum" or "scan"."""
+    if str(source) in PROFILES:
+        return "profile"
+    return {".toml": "recipe", ".exr": "spectrum"}.get(Path(source).suffix.lower(), "scan")
+
+
 @dataclass(frozen=True)
 class Recipe:
     """A surface and the parameters of its spectrum.
@@ -166,34 +173,12 @@ class Recipe:
         of_spectrum = {key: given.pop(key) for key in _OF_PROFILE if key in given}
         return cls({"profile": name, **given}, Settings.of(**{**default, **of_spectrum, **settings}))
 
-    @classmethod
-    def of_source(cls, source: str, values: Mapping[str, Any] | None = None, extent: str = "sample") -> Recipe:
-        """Return the recipe of a profile, in a file (.toml), or of a scan, with values in the place of its own.
-
-        Args:
-            source: the name of the profile, or the file.
-            values: by the names that they have in a recipe, under `[surface]` and `[spectrum]`.
-            extent: of a scan, where `values` have none.
-
-        Raises:
-            FileNotFoundError: if there is no such recipe.
-            ValueError: if it or a value is wrong, or unknown.
-        """
-        given = dict(values or {})
-        settings = {name: given.pop(name) for name in SPECTRUM_PARAMETERS if name in given}
-        path = Path(source)
-        if source in PROFILES:
-            recipe = cls.of_profile(source, {}, **settings)
-        elif path.suffix.lower() == ".toml":
-            recipe = cls.load(path, **settings)
-        elif path.suffix.lower() == ".exr" and path.is_file():
-            raise RequestError(f"{source}: got a saved spectrum, wanted the recipe, the profile or the scan")
-        else:
-            recipe = cls({"scan": path.name}, Settings.of(**{"extent": extent, **settings}), path.parent)
-        if unknown := [name for name in given if name not in recipe.known]:
-            similar = did_you_mean(unknown[0], recipe.known)
-            raise RequestError(f"{source}: got {', '.join(unknown)}, wanted some of {', '.join(recipe.known)}{similar}")
-        return cls({**recipe.surface, **given}, recipe.settings, recipe.folder)
+    def as_sample(self) -> Recipe:
+        """Return the recipe with extent "sample"; its heights are not read again."""
+        assert isinstance(self.settings, ScalarSettings)
+        sample = replace(self, settings=replace(self.settings, extent="sample"))
+        sample.__dict__["_height_field"] = self.height_field()
+        return sample
 
     @property
     def known(self) -> tuple[str, ...]:
@@ -375,7 +360,7 @@ class Recipe:
 
 def theory_in(path: Path) -> str:
     """Return the theory of a recipe, or of a saved spectrum."""
-    if path.suffix.lower() == ".toml":
+    if kind_of(path) == "recipe":
         return Recipe.load(path).settings.theory
     return "rigorous" if is_rigorous(path) else "scalar"
 

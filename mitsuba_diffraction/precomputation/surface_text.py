@@ -9,42 +9,37 @@ from pathlib import Path
 from typing import Any
 
 from ..errors import RequestError, is_number
-from ..progress import say
-from ..surface.gratings import RENAMED
 from ..surface.prepare import step_of
-from .recipe import source_named
 
 _LISTS = ("pixel_size", "unit", "wavelengths", "prepare")
 """Names that may be repeated, for a list."""
 
 
 def parsed(text: str) -> tuple[str, dict[str, Any]]:
-    """Return source, as `source_named`, and values; numbers, booleans, steps and repeated names as in a recipe.
+    """Return the source as it is written, and values; numbers, booleans, steps and repeated names as in a recipe.
 
     The source is the longest beginning that is a file, as names of files may have commas; so is a value.
 
     Raises:
-        RequestError: if a part is not name=value, a name is repeated that has no list, or there is no such surface.
+        RequestError: if a part is not name=value, or a name is repeated that has no list.
     """
-    source, parts = split_source(text)
+    source, parts = _split_source(text)
     values = dict[str, Any]()
-    for name, equals, value in (item.strip().partition("=") for item in _items(parts)):
+    for name, equals, value in (map(str.strip, item.partition("=")) for item in _items(parts)):
         if not (name and equals and value) or (name in values and name not in _LISTS):
             got = f"{text}: got {name + equals + value!r}"
             raise RequestError(f"{got}, wanted name=value, each name once{_advice(name, values)}")
         found = step_of(value) if name == "prepare" else converted(value)
         values[name] = [*values.get(name, []), found] if name in _LISTS else found
-    if source in RENAMED:
-        say("note", f"{source} is the measured skin; {RENAMED[source]} is a synthetic one")
     single = {name: values[name][0] for name in _LISTS[:-1] if len(values.get(name, ())) == 1}
-    return source_named(source), values | single
+    return source, values | single
 
 
-def split_source(text: str) -> tuple[str, list[str]]:
+def _split_source(text: str) -> tuple[str, list[str]]:
     """Return the source as it is written, the longest beginning that is a file, and the parts after it."""
     parts = text.split(",")
     end = next((end for end in range(len(parts), 1, -1) if os.path.exists(",".join(parts[:end]))), 1)
-    return ",".join(parts[:end]), parts[end:]
+    return ",".join(parts[:end]) if end > 1 else parts[0].strip(), parts[end:]
 
 
 def _items(parts: list[str]) -> Iterator[str]:

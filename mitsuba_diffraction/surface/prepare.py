@@ -37,9 +37,18 @@ def seam_steps(height_field: HeightField) -> dict[str, tuple[float, float]]:
     return found
 
 
-def is_seam_visible(steps: dict[str, tuple[float, float]]) -> bool:
-    """Return whether a seam is visible: the period of the tiling would then act as a grating."""
-    return any(across > max(_MIN_VISIBLE_RATIO * inside, _MIN_VISIBLE_STEP) for across, inside in steps.values())
+def repeats_without_seam(height_field: HeightField) -> tuple[bool, str]:
+    """Return whether the seams of a tiling are invisible, and why; otherwise its period would act as a grating.
+
+    In noise, in which neighbouring pixels differ by more than the r.m.s. height, no seam could be seen.
+    """
+    pairs, height = seam_steps(height_field).items(), float(np.nanstd(height_field.heights))
+    if any(inside > max(height, _MIN_VISIBLE_STEP) for _, (_, inside) in pairs):
+        return False, "neighbouring pixels differ by more than the r.m.s. height, as in noise"
+    seen = any(across > max(_MIN_VISIBLE_RATIO * inside, _MIN_VISIBLE_STEP) for _, (across, inside) in pairs)
+    texts = [f"{across * 1e3:.3g} nm along {axis} ({inside * 1e3:.3g} inside)" for axis, (across, inside) in pairs]
+    edges = "its edges do not meet" if seen else "its edges meet"
+    return not seen, f"{edges}, r.m.s. steps at the seam {' and '.join(texts)}"
 
 
 _NEIGHBOURHOOD = 5  # side of the neighbourhood of a pixel, pixels

@@ -6,7 +6,6 @@ import os
 from collections.abc import Callable, Mapping
 from contextlib import AbstractContextManager
 from dataclasses import dataclass, fields, replace
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -16,13 +15,13 @@ from ..files.writing import examples_folder
 from ..optics.materials import refractive_index
 from ..optics.media import DEFAULT_INT_IOR
 from ..precomputation.grating_spectrum import GratingSpectrum
-from ..precomputation.recipe import Recipe, parameters_of_profile, source_named
-from ..precomputation.spectra import Spectrum, load_spectrum
+from ..precomputation.recipe import Recipe, parameters_of_profile
+from ..precomputation.requested_surface import RequestedSurface
+from ..precomputation.spectra import Spectrum
 from ..precomputation.surface_text import written
 from ..progress import NAME, Progress, no_progress
 from ..settings import FROM_RADIUS, VISIBLE, wavelengths_inside
 from ..spectrum.tables import SliceTable
-from ..surface.gratings import PROFILES
 
 AIR = 1.000277  # index of the outside, as Mitsuba's "air"
 
@@ -134,7 +133,6 @@ class Surface:
         parameters: Mapping[str, Any],
         progress: Callable[[str], AbstractContextManager[Progress]] = no_progress,
         command: str = "",
-        known: tuple[str, ...] = (),
     ) -> Surface:
         """Return the surface of a recipe, whose spectrum is computed unless it is cached.
 
@@ -145,9 +143,8 @@ class Surface:
             parameters: of the material; others are refused.
             progress: of the computation.
             command: as the attribute.
-            known: names of the other parameters, for the message.
         """
-        material = material_from(_with_plastic(recipe, parameters, covered=not command), known)
+        material = material_from(_with_plastic(recipe, parameters, covered=not command))
         if recipe.settings.theory == "rigorous":  # before its table is computed
             raise RequestError(f"{name}: got theory=rigorous, wanted a surface of scalar theory")
         if not command and material.coat_ior > 1 and recipe.settings.wavelengths == VISIBLE:
@@ -160,51 +157,53 @@ class Surface:
         return cls(name, spectrum, recipe, grating, material, command)
 
     @classmethod
-    def named(
+    def named(cls, source: str | os.PathLike[str], parameters: Mapping[str, Any]) -> Surface:
+        """Return the surface of a profile or a file, with parameters of it and of its material; see `requested`."""
+        return cls.requested(RequestedSurface.named(os.fspath(source), parameters, OF_SCENE))
+
+    @classmethod
+    def requested(
         cls,
-        source: str | os.PathLike[str],
-        parameters: Mapping[str, Any],
+        surface: RequestedSurface,
         progress: Callable[[str], AbstractContextManager[Progress]] = no_progress,
     ) -> Surface:
-        """Return the surface of a recipe (.toml), a saved spectrum (.exr), a profile or a scan.
+        """Return a requested surface; what a scene says of its material stands aside (`OF_SCENE`).
 
         Args:
-            source: the file, or the name of the profile.
-            parameters: of the material, and what a recipe of the surface may say (`Recipe.known`).
+            surface: a recipe, a saved spectrum, a profile or a scan.
             progress: of the computation.
 
         Raises:
             FileNotFoundError: if there is no such file.
             RequestError: if a parameter is wrong, or the page does not show such a surface.
         """
-        path, values = Path(source_named(os.fspath(source))), dict(parameters)
-        if path.suffix.lower() == ".exr":
-            material = material_from(values)
-            return cls(path.stem, load_spectrum(path), None, {"filename": path.name}, material)  # type: ignore[arg-type]
-        if (theory := values.pop("theory", "scalar")) != "scalar":
+        path, parameters = surface.path, dict(surface.aside)
+        if surface.is_spectrum:
+            material = material_from(parameters)
+            return cls(path.stem, surface.spectrum(), None, {"filename": path.name}, material)  # type: ignore[arg-type]
+        if (theory := parameters.pop("theory", "scalar")) != "scalar":
             raise RequestError(f"theory: got {theory}, wanted scalar")
-        known = tuple(name for name in Recipe.of_source(str(path)).known if name not in _OF_SCENE)
-        own = {name: values.pop(name) for name in known if name in values}
-        recipe, command = Recipe.of_source(str(path), own), ""
-        is_recipe = path.suffix.lower() == ".toml"
+        own, recipe, command = dict(surface.values), surface.recipe, ""
+        is_recipe = surface.kind == "recipe"
         # A recipe of the package has its name in scenes and commands, wherever they are.
         of_package = is_recipe and path.resolve().parent == (examples_folder() / "precompute").resolve()
         name = path.stem if of_package else path.name
         grating: dict[str, Any]
-        if str(path) in PROFILES and own.keys() <= set(parameters_of_profile(str(path))):
+        if surface.kind == "profile" and own.keys() <= set(parameters_of_profile(str(path))):
             grating = {"profile": str(path), **own}
         elif is_recipe and not own:
             grating = {"filename": name}
         else:
             grating = {"filename": f"{path.stem}.exr"}
             extent = {} if is_recipe else {"extent": recipe.settings.extent}
-            surface = written(name, own | extent)
-            command = shell_command(NAME, "precompute", surface, "-o", f"{path.stem}.exr")
-        return cls.of_recipe(recipe, path.stem, grating, values, progress, command, known)
+            text = written(name, own | extent)
+            command = shell_command(NAME, "precompute", text, "-o", f"{path.stem}.exr")
+        return cls.of_recipe(recipe, path.stem, grating, parameters, progress, command)
 
 
 SHORTEST = VISIBLE[0]  # nm, of the wavelengths of a page
-_OF_SCENE = {*_NOT_SHOWN, *(field.name for field in fields(ViewedMaterial))}
+OF_SCENE = ("theory", *(field.name for field in fields(ViewedMaterial)), *_NOT_SHOWN)
+"""Names of what a scene says of a grating, beside the values of its recipe."""
 
 
 def _with_plastic(recipe: Recipe, parameters: Mapping[str, Any], covered: bool) -> dict[str, Any]:
@@ -223,8 +222,8 @@ def _with_plastic(recipe: Recipe, parameters: Mapping[str, Any], covered: bool) 
     return own | dict(parameters)
 
 
-def material_from(parameters: Mapping[str, Any], others: tuple[str, ...] = ()) -> ViewedMaterial:
-    """Return the material from the parameters of a scene; `others` are names for the message.
+def material_from(parameters: Mapping[str, Any]) -> ViewedMaterial:
+    """Return the material from the parameters of a scene.
 
     Raises:
         RequestError: if one is wrong, or not shown in a page.
@@ -234,9 +233,8 @@ def material_from(parameters: Mapping[str, Any], others: tuple[str, ...] = ()) -
         if name in _NOT_SHOWN:
             raise RequestError(f"{name}: got {value!r}, and the page shows {_NOT_SHOWN[name]}")
         if name not in known:
-            names = (*sorted(known), *sorted(others))
-            similar = did_you_mean(name, names)
-            raise RequestError(f"{name}: got {value!r}, wanted a parameter among {', '.join(names)}{similar}")
+            similar = did_you_mean(name, known)
+            raise RequestError(f"{name}: got {value!r}, wanted a parameter among {', '.join(sorted(known))}{similar}")
     if "material" in parameters and "int_ior" in parameters:
         raise RequestError("material: a conductor or a perfect mirror takes no int_ior; give one or the other")
     return replace(ViewedMaterial(), **parameters)

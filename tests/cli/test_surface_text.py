@@ -1,4 +1,4 @@
-"""SURFACE[,name=value…]: one form for all commands, and the options that stood for it until version 0.3."""
+"""SURFACE[,name=value…]: one form for all commands, and the options of two of them."""
 
 import importlib
 import re
@@ -9,37 +9,12 @@ import pytest
 import typer
 
 from mitsuba_diffraction.cli import app
-from mitsuba_diffraction.cli.former_options import FORMER, surface_argument
-from mitsuba_diffraction.errors import RequestError
-from mitsuba_diffraction.precomputation.recipe import FLAGS, Recipe
+from mitsuba_diffraction.precomputation.recipe import SCAN_KEYS
+from mitsuba_diffraction.precomputation.requested_surface import RequestedSurface
 from mitsuba_diffraction.precomputation.surface_text import parsed, written
+from mitsuba_diffraction.settings import SPECTRUM_PARAMETERS
 
-SCAN, RELIEF = "scan.npy,pixel_size=0.5,extent=tile", "lamellar,depth=0.1,theory=rigorous,int_ior=1.5"
-"""Of scalar and of rigorous theory; an option is added to the part that does not have its value."""
-OPTIONS = {
-    "--pixel-size": ("scan.npy,extent=tile", "0.5"),
-    "--height-range": ("grey.npy,pixel_size=0.5,extent=tile", "0.3"),
-    "--fill-missing": (SCAN, ""),
-    "--channel": (SCAN, "2"),
-    "--unit": (SCAN, "nm"),
-    "--prepare": (SCAN, "rotate=-3"),
-    "--plane": (SCAN, ""),
-    "--theory": ("lamellar,depth=0.1", "rigorous"),
-    "--coherence-length": (SCAN, "12"),
-    "--tolerance": (SCAN, "2e-2"),
-    "--largest-height-range": (SCAN, "30"),
-    "--extent": ("scan.npy,pixel_size=0.5", "sample"),
-    "--largest-angle": (SCAN, "60"),
-    "--representation": (SCAN, "taylor"),
-    "--terms": (f"{SCAN},representation=taylor", "6"),
-    "--heights-from": (f"{SCAN},representation=taylor", "lowest"),
-    "--int-ior": ("lamellar,depth=0.1,theory=rigorous", "BK7"),
-    "--material": ("lamellar,depth=0.1,theory=rigorous", "Al"),
-    "--ext-ior": (RELIEF, "1.4"),
-    "--polarised": (RELIEF, ""),
-    "--transmission": (RELIEF, "sheet"),
-}
-LASTING = {"--representation", "--tolerance", "--coherence-length", "--terms", "--heights-from"}
+SCAN = "scan.npy,pixel_size=0.5,extent=tile"
 COMMANDS = {"view", "inspect", "export", "precompute", "efficiency", "validate", "benchmark"}
 
 
@@ -56,7 +31,7 @@ def computed(monkeypatch):
     """The recipes of which `precompute` would compute the spectra."""
     recipes = []
     module = importlib.import_module("mitsuba_diffraction.cli.precompute")
-    monkeypatch.setattr(module, "_precompute", lambda _, recipe, *rest: recipes.append(recipe))
+    monkeypatch.setattr(module, "_precompute", lambda request, *rest: recipes.append(request.recipe))
     return recipes
 
 
@@ -64,86 +39,71 @@ def commands():
     return typer.main.get_command(app).commands
 
 
-@pytest.mark.parametrize("option", FORMER)
-def test_an_option_of_version_0_3_gives_the_recipe_of_the_new_form(option, command, computed):
-    surface, value = OPTIONS[option]
-    key = FORMER[option]
-    new = f"{surface},{key}={value or ('true' if key in FLAGS else 'level_plane')}"
-    words = [option, value] if value else [option]
-    for line in ([new], [surface, *words], [surface, "=".join(words)]):
-        code, out, error = command("precompute", *line, "-o", "out.exr")
-        assert (code, out) == (0, ""), error
-        wanted = (
-            []
-            if line == [new] or option in LASTING
-            else [f"{' '.join(line[1:])} is given as {new} from version 0.5 on"]
-        )
-        assert [part.partition("note: ")[2] for part in error.splitlines()] == wanted
-    assert computed[0] == computed[1] == computed[2]
-    assert computed[0] != Recipe.of_source(*parsed(surface), "tile")
+@pytest.mark.parametrize(
+    ("options", "values"),
+    [
+        (["--tolerance", "0.02"], "tolerance=0.02"),
+        (["--tolerance=0.02", "--coherence-length", "12"], "tolerance=0.02,coherence_length=12"),
+        (["--representation", "taylor", "--terms", "6"], "representation=taylor,terms=6"),
+        (["--representation=taylor", "--heights-from=lowest"], "representation=taylor,heights_from=lowest"),
+        (["--representation=taylor", "--terms=auto"], "representation=taylor,terms=auto"),
+    ],
+)
+def test_options_of_precompute_are_values_of_each_surface(options, values, command, computed):
+    for line in (["blazed", SCAN, *options], [f"blazed,{values}", f"{SCAN},{values}"]):
+        code, out, error = command("precompute", *line)
+        assert (code, out, error) == (0, "", "")
+    assert computed[:2] == computed[2:]
+    assert computed[0].settings != RequestedSurface.of("blazed").recipe.settings
 
 
-@pytest.mark.parametrize("name", sorted(COMMANDS))
-def test_every_command_with_a_surface_takes_its_options(name, command, monkeypatch):
-    of_command = commands()[name]
-    module = importlib.import_module(of_command.callback.__module__)
-    found = []
-
-    def refuse(text):
-        found.append(text)
-        raise RequestError("seen")
-
-    monkeypatch.setattr(module, "parsed", refuse)
-    output = [] if name in ("efficiency", "validate", "benchmark") else ["-o", "out.csv"]
-    code, _, error = command(name, "--unit", "um", "scan.npy", "--unit=nm", *output, "--fill-missing")
-    assert (code, error) == (2, "mitsuba-diffraction: error: seen\n")
-    assert found == ["scan.npy,unit=um,unit=nm,fill_missing=true"]
+def test_options_of_inspect_are_values_of_its_scan(command):
+    np.save("grey.npy", np.random.default_rng(3).integers(0, 255, (64, 64), np.uint8))
+    numbers = []
+    for line in ("grey.npy,pixel_size=0.05,height_range=0.3", "grey.npy --pixel-size 0.05 --height-range=0.3"):
+        assert command(f"inspect {line} --json numbers.json --overwrite")[0] == 0
+        numbers.append(Path("numbers.json").read_text(encoding="utf-8"))
+    assert numbers[0] == numbers[1]
+    code, _, error = command("inspect scan.npy,pixel_size=0.5 --pixel-size 0.4")
+    assert (code, "pixel_size: got 0.5 and 0.4, wanted one value" in error) == (2, True)
 
 
-def test_help_shows_no_option_of_a_surface(command):
-    assert {name for name, found in commands().items() if surface_argument(found)} == COMMANDS
+def test_help_shows_what_a_surface_has_as_options(command):
+    keys = {f"--{key.replace('_', '-')}" for key in (*SCAN_KEYS, *SPECTRUM_PARAMETERS)}
+    lasting = {
+        "inspect": {"--pixel-size", "--height-range"},
+        "precompute": {"--representation", "--tolerance", "--coherence-length", "--terms", "--heights-from"},
+        "benchmark": {"--tolerance", "--terms"},  # of its own
+    }
     for name in COMMANDS:
-        options = {option for parameter in commands()[name].params for option in parameter.opts}
-        own = {"--tolerance", "--terms"} if name == "benchmark" else set()
-        assert options & FORMER.keys() == own
+        (surface,) = (p for p in commands()[name].params if p.param_type_name == "argument" and "SURFACE" in p.metavar)
+        assert "name=value" in surface.help
         code, out, _ = command(name, "--help")
-        assert (code, [option for option in FORMER.keys() - own if option in out]) == (0, [])
+        assert code == 0
+        assert {word for word in re.findall(r"--[a-z-]+", out) if word in keys} == lasting.get(name, set())
+        code, _, error = command(name, *(["blazed"] if name != "benchmark" else []), "--extent", "tile")
+        assert (code, "No such option: --extent" in error) == (2, True)
 
 
-def test_a_flag_of_version_0_3_may_be_false(command, computed):
-    assert command(f"precompute {SCAN} --fill-missing=false")[0] == 0
-    assert computed[0].surface["fill_missing"] is False
-
-
-def test_an_option_that_never_was_one_is_corrected(command):
-    code, _, error = command("efficiency blazed --wavelengths 500")
-    assert code == 2
-    assert "No such option: --wavelengths" in error
-
-
-def test_several_options_are_one_line(command, computed):
-    code, _, error = command("precompute blazed --extent tile --coherence-length=20 --largest-angle 60")
-    new = "blazed,extent=tile,coherence_length=20,largest_angle=60"
-    assert code == 0
-    assert error.partition("note: ")[2] == f"--extent tile --largest-angle 60 are given as {new} from version 0.5 on\n"
-    assert computed == [Recipe.of_source(*parsed(new))]
-
-
-def test_options_beside_a_scan_are_those_of_the_scan(command, computed):
-    code, _, error = command("precompute blazed scan.npy --extent tile --pixel-size 1 --tolerance 0.1")
-    assert code == 0
-    assert error.endswith(
-        "--extent tile --pixel-size 1 are given as blazed,extent=tile,tolerance=0.1 "
-        "scan.npy,extent=tile,pixel_size=1,tolerance=0.1 from version 0.5 on\n"
-    )
-    assert ["pixel_size" in recipe.surface for recipe in computed] == [False, True]
-
-
-def test_options_beside_a_scan_whose_name_has_commas_are_those_of_the_scan(command, computed):
-    Path("scan.npy").rename("blazed,depth=1.npy")
-    code, _, error = command("precompute blazed blazed,depth=1.npy,tolerance=0.1 --pixel-size 1")
-    assert code == 0
-    assert "given as blazed blazed,depth=1.npy,tolerance=0.1,pixel_size=1 from version 0.5 on" in error
+def test_one_rule_tells_whether_a_scan_is_a_tile(command, computed):
+    """By its seam, in every command: one period of a sinusoid, and the same with an end that does not fit."""
+    x = np.arange(64) / 64
+    rows = {"period.npy": np.sin(2 * np.pi * x), "piece.npy": np.sin(4 * x)}
+    heights = {name: np.tile(row, (64, 1)) for name, row in rows.items()}
+    heights["noise.npy"] = np.random.default_rng(2).random((64, 64))
+    for name, extent in {"period.npy": "tile", "piece.npy": "sample", "noise.npy": "sample"}.items():
+        np.save(name, 0.1 * heights[name])
+        text = f"{name},pixel_size=0.05"
+        code, _, error = command("precompute", text)
+        assert (code, computed[-1].settings.extent) == (0, extent)
+        assert f"note: {name}: taken as extent={extent}: " in error
+        code, out, error = command("inspect", text)
+        assert (code, {"tile": "(periodic tile)", "sample": "(sample of a larger surface)"}[extent] in out) == (0, True)
+        assert f"note: {name}: taken as extent={extent}: " in error
+        code, out, _ = command("efficiency", text, "--wavelength", "500")
+        assert (code, "mirror" in out) == (0, extent == "sample")
+        for given in ("tile", "sample"):
+            assert RequestedSurface.of(f"{text},extent={given}").recipe.settings.extent == given
 
 
 @pytest.mark.parametrize(
@@ -151,6 +111,7 @@ def test_options_beside_a_scan_whose_name_has_commas_are_those_of_the_scan(comma
     [
         ("blazed", "blazed", {}),
         ("blazed,period=1.6, depth=.2", "blazed", {"period": 1.6, "depth": 0.2}),
+        ("blazed , period = 1.6 , depth= .2", "blazed", {"period": 1.6, "depth": 0.2}),
         ("scan.npy,fill_missing=True,channel=2", "scan.npy", {"fill_missing": True, "channel": 2}),
         ("scan.npy,unit=nm", "scan.npy", {"unit": "nm"}),
         ("scan.npy,unit=um,unit=nm", "scan.npy", {"unit": ["um", "nm"]}),

@@ -434,18 +434,18 @@ def test_inspect_prints_numbers_and_draws_a_slide(folder, command):
 def test_a_file_name_is_shown_as_it_is(folder, command):
     np.save("[red]:smile:.npy", np.random.default_rng(0).standard_normal((40, 40)) * 0.01)
     code, out, err = command("inspect [red]:smile:.npy,pixel_size=0.08 -o picture.png")
-    assert (code, err) == (0, "")
+    assert (code, "[red]:smile:.npy: taken as extent=sample: neighbouring pixels" in err) == (0, True)
     assert "surface           [red]:smile:.npy" in out
 
 
 @pytest.mark.slow
 def test_a_profile_of_one_period_is_inspected(folder, command):
     np.save("ridges.npy", 0.1 * np.abs(np.sin(np.pi * np.arange(256) / 256))[None])
-    code, out, err = command("inspect ridges.npy,pixel_size=0.005078125")
+    code, out, err = command("inspect ridges.npy,pixel_size=0.005078125,extent=sample")
     assert (code, err) == (0, "")
     assert "none stands out (for a single period of a grating: extent=tile)" in out
-    code, out, err = command("inspect ridges.npy,pixel_size=0.005078125,extent=tile --overwrite")
-    assert (code, err) == (0, "")
+    code, out, err = command("inspect ridges.npy,pixel_size=0.005078125 --overwrite")
+    assert (code, "ridges.npy: taken as extent=tile: its edges meet" in err) == (0, True)
     assert "period            1.3 µm along 0°" in out
     tips = re.findall(r"tip broadening.*?\)\s+(\S+)", out)
     assert tips == ["+0.0%", "+0.0%"]

@@ -11,7 +11,7 @@ import pytest
 import mitsuba_diffraction as md
 from mitsuba_diffraction import GratingSpectrum, Recipe
 from mitsuba_diffraction.precomputation import recipe as recipe_module
-from mitsuba_diffraction.precomputation import surface_text
+from mitsuba_diffraction.precomputation.requested_surface import RequestedSurface
 from mitsuba_diffraction.precomputation.spectra import build_spectrum
 from mitsuba_diffraction.settings import RigorousSettings, ScalarSettings, Settings
 from mitsuba_diffraction.surface.readers import read_height_field
@@ -482,7 +482,7 @@ def test_digest_does_not_depend_on_stated_defaults():
     ],
 )
 def test_digest_does_not_depend_on_how_a_number_is_written(one, same):
-    first, second = (Recipe.of_source(*surface_text.parsed(text)) for text in (one, same))
+    first, second = (RequestedSurface.of(text).recipe for text in (one, same))
     assert first.patches == second.patches
     assert first.digest() == second.digest()
 

@@ -112,7 +112,10 @@ def tiles() -> list[Case]:
     return cases
 
 
-def scan_case(height_field: HeightField) -> Case:
-    """Return a scan as a sample of an irregular surface, with the longest coherence length that it supports."""
-    coherence = effective_coherence_length(height_field, SUN_COHERENCE_LENGTH)
-    return Case(height_field.source, height_field, "sample", coherence)
+def scan_case(recipe: Recipe) -> Case:
+    """Return a scan, with the coherence length of its recipe; of a sample at most the longest that it supports."""
+    field, settings = recipe.height_field(), recipe.settings
+    coherence = settings.coherence_length
+    if settings.extent == "sample":
+        coherence = effective_coherence_length(field, coherence)
+    return Case(field.source, field, settings.extent, coherence)

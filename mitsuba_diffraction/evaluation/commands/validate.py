@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import replace
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated
 
 import typer
 
@@ -12,7 +12,7 @@ from ...cli.arguments import KEYS_OF_RECIPES, SURFACE, Define, Overwrite, Varian
 from ...errors import RequestError
 from ...files import outputs
 from ...precomputation.recipe import Recipe
-from ...precomputation.surface_text import parsed
+from ...precomputation.requested_surface import RequestedSurface
 from ...progress import progress_bar, show, tell
 from ..record import Check
 
@@ -44,12 +44,14 @@ def validate(
     scene = SceneFile(surface, scene_parameters(define)) if surface and surface.lower().endswith(".xml") else None
     if define and scene is None:
         raise RequestError(f"-D: got {surface or 'no scene'}, wanted a scene (.xml), which has parameters")
-    source, values = ("", {}) if surface is None or scene is not None else parsed(surface)
-    recipe = _recipe(source, values) if source else None
-    reads = scene.files() if scene is not None else [] if recipe is None else [Path(source), *recipe.files]
+    requested = None if surface is None or scene is not None else RequestedSurface.of(surface)
+    recipe = None if requested is None else _recipe(requested)
+    reads = scene.files() if scene is not None else [] if requested is None else requested.files
     writes = [(option, path) for option, path in (("--json", json), ("--markdown", markdown)) if path is not None]
     outputs.check_outputs(reads, writes, overwrite=overwrite)
     mi.set_variant(chosen)
+    if requested is not None:
+        requested.say_extent()
     if scene is not None:
         with progress_bar("pictures") as progress:
             comparison = compare_scene(scene, progress)
@@ -87,10 +89,11 @@ def _surface_checks(recipe: Recipe) -> tuple[Check, ...]:
     return surface_checks(recipe.height_field(), spectrum)
 
 
-def _recipe(source: str, values: dict[str, Any]) -> Recipe:
-    recipe = Recipe.of_source(source, values)
+def _recipe(requested: RequestedSurface) -> Recipe:
+    recipe = requested.recipe
     if recipe.patches > 1:
         recipe = replace(recipe, surface={**recipe.surface, "patches": 1})
     if recipe.settings.theory == "rigorous":
-        raise RequestError(f"{source}: got theory = 'rigorous', wanted scalar; precompute prints the measured errors")
+        got = f"{requested.title}: got theory = 'rigorous'"
+        raise RequestError(f"{got}, wanted scalar; precompute prints the measured errors")
     return recipe

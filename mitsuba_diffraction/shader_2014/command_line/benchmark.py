@@ -10,8 +10,7 @@ import typer
 from ...cli.arguments import KEYS_OF_RECIPES, SURFACE, Overwrite, Variant, check_suffix
 from ...errors import RequestError
 from ...files import outputs
-from ...precomputation.recipe import Recipe
-from ...precomputation.surface_text import parsed
+from ...precomputation.requested_surface import RequestedSurface
 from ...progress import progress_bar, show, table
 
 
@@ -46,9 +45,8 @@ def benchmark(
     if plot is not None:
         check_suffix("--plot", plot, ".png")
     writes = [(option, path) for option, path in (("--json", json), ("--plot", plot)) if path is not None]
-    source, values = ("", {}) if scan is None else parsed(scan)
-    recipe = Recipe.of_source(source, values) if source else None
-    outputs.check_outputs([Path(source), *recipe.files] if recipe else [], writes, overwrite=overwrite)
+    requested = None if scan is None else RequestedSurface.of(scan)
+    outputs.check_outputs([] if requested is None else requested.files, writes, overwrite=overwrite)
     if terms and (scan is not None or surface or tolerance):
         raise RequestError("--terms: got other surfaces or tolerances, too; it has tiles of its own")
     if pictures and (scan is not None or surface or tolerance or terms or plot is not None):
@@ -58,10 +56,11 @@ def benchmark(
     if unknown := set(surface or []) - set(names):
         raise RequestError(f"--surface: got {', '.join(sorted(unknown))}, wanted among {', '.join(names)}")
     cases = [case for case in cases if not surface or case.name in surface]
-    if recipe is not None:
-        if "scan" not in recipe.surface:
-            raise RequestError(f"{source}: got no scan; --surface takes the built-in surfaces")
-        cases.append(scan_case(recipe.height_field()))
+    if requested is not None:
+        if "scan" not in requested.recipe.surface:
+            raise RequestError(f"{requested.title}: got no scan; --surface takes the built-in surfaces")
+        cases.append(scan_case(requested.recipe))
+        requested.say_extent()
     mi.set_variant(choose_variant(variant))
     if terms:
         _measure_terms(json, plot)
