@@ -81,7 +81,7 @@ def _commands(
 
 
 class _CtrlC:
-    """Handler of SIGINT that raises KeyboardInterrupt and records it; during an import, after its end.
+    """Handler of SIGINT and SIGTERM that raises KeyboardInterrupt and records it; during an import, after its end.
 
     The record is needed as Mitsuba converts exceptions raised in a plugin into errors of the scene. While an extension
     module is being imported, as Mitsuba, an exception is converted or aborts the process.
@@ -96,7 +96,7 @@ class _CtrlC:
             self._again.cancel()
         while frame is not None:
             if frame.f_code.co_filename.startswith("<frozen importlib"):
-                self._again = threading.Timer(0.05, _thread.interrupt_main)
+                self._again = threading.Timer(0.05, _thread.interrupt_main, [number])
                 self._again.start()
                 return
             frame = frame.f_back
@@ -117,10 +117,13 @@ def main() -> None:
     log, logger = _Log(), logging.getLogger(__package__.partition(".")[0])
     logger.addHandler(log)
     options: dict[str, bool] = {}
-    ctrl_c, before = _CtrlC(), signal.getsignal(signal.SIGINT)
+    ctrl_c = _CtrlC()
+    # Schedulers and systems that shut down end a process by SIGTERM.
+    before = {number: signal.getsignal(number) for number in (signal.SIGINT, signal.SIGTERM)}
     # If SIGINT is ignored, as in background jobs of a script, it stays ignored.
-    if before is not signal.SIG_IGN:
-        signal.signal(signal.SIGINT, ctrl_c)
+    before = {number: handler for number, handler in before.items() if handler not in (signal.SIG_IGN, None)}
+    for number in before:
+        signal.signal(number, ctrl_c)
     try:
         code = app(prog_name=NAME, standalone_mode=False, obj=options) or 0
         if code == 130:  # newer versions of Typer return this code on Ctrl-C
@@ -129,7 +132,8 @@ def main() -> None:
         converted = ctrl_c.pressed and not isinstance(error, Stopped)
         code = _report(KeyboardInterrupt() if converted else error, **options)
     finally:
-        signal.signal(signal.SIGINT, before)
+        for number, handler in before.items():
+            signal.signal(number, handler)
         logger.removeHandler(log)
     sys.exit(code)
 

@@ -5,9 +5,6 @@ from __future__ import annotations
 import functools
 import inspect
 import math
-import signal
-from collections.abc import Iterator
-from contextlib import contextmanager
 from pathlib import Path
 from typing import Annotated
 
@@ -128,7 +125,7 @@ def design(
         finest = f"the finest strokes are 1/{strokes:.0f} of the picture"
         note = f"{texels} texels along the period, {height_range:g} µm deep; {finest}"
     bar = progress_bar(f"design of {target.name}", "iterations")
-    with named_as_options(options), bar as progress, _sigterm_interrupts():
+    with named_as_options(options), bar as progress:
         found = search(
             picture,
             texel,
@@ -165,20 +162,6 @@ def design(
         tell(str(verdict))
     if found.interrupted:
         raise Stopped(f"{relief} holds the best relief so far")
-
-
-@contextmanager
-def _sigterm_interrupts() -> Iterator[None]:
-    """Let SIGTERM, with which schedulers end a job, interrupt as Ctrl-C does."""
-
-    def interrupt(number: int, frame: object) -> None:
-        raise KeyboardInterrupt
-
-    before = signal.signal(signal.SIGTERM, interrupt)
-    try:
-        yield
-    finally:
-        signal.signal(signal.SIGTERM, before)
 
 
 def _say_effort(chosen: str, seconds: float, memory: float) -> None:

@@ -30,7 +30,7 @@ MIN_WARNED_SECONDS = 3600
 
 
 class Stopped(Exception):
-    """Interruption by Ctrl-C after something has been saved; the text names it."""
+    """Interruption by Ctrl-C or SIGTERM after something has been saved; the text names it."""
 
 
 def render(
@@ -113,7 +113,7 @@ def render(
     import mitsuba as mi
 
     from ..render.cluster import trace_on
-    from ..render.passes import trace_locally
+    from ..render.passes import deferred_interrupt, trace_locally
     from ..render.scene_file import SceneFile
     from ..render.sums import checkpoint_path
     from ..render.turntable import animations_of, save_animation
@@ -167,9 +167,10 @@ def render(
                 _announce_others(scene.name, len(pictures) - 1, time.perf_counter() - begin)
             request.pop("announce", None)
         if frames is not None:
-            for animation in animations_of(target):
-                save_animation([_preview(path) for path in pictures], animation)
-                tell(f"{animation}: animated preview, {frames} frames")
+            with deferred_interrupt():
+                for animation in animations_of(target):
+                    save_animation([_preview(path) for path in pictures], animation)
+                    tell(f"{animation}: animated preview, {frames} frames")
 
 
 def _announce(
@@ -283,7 +284,7 @@ def _picture(
         complete: number of completed pictures, as text to report if Ctrl-C interrupts this one.
     """
     from ..render.denoise import check_requirements, denoised_picture
-    from ..render.passes import Finished, Interrupted
+    from ..render.passes import Finished, Interrupted, deferred_interrupt
     from ..render.passes import render as trace
     from ..render.spectral_image import exposure_of_preview, save_preview, stored_digest, wider_hats
     from ..render.sums import checkpoint_path, discard_checkpoints
@@ -318,17 +319,19 @@ def _picture(
         if complete is None:
             raise
         raise Stopped(f"{complete}; the same command with --resume continues") from None
-    try:
-        if _is_spectral(path):
-            with stage("writing"):
-                image.save(path, **stored)
-        with stage("preview"):
-            clean = partial(denoised_picture, scenes[0]) if scenes else None
-            exposure = save_preview(image, preview, exposure, clean, view)
-    except (OSError, RuntimeError) as error:
-        kept = f"; {checkpoint} is kept, and --resume continues from it" if checkpoint.exists() else ""
-        written = f"{path} or its preview" if _is_spectral(path) else str(path)
-        raise RuntimeError(f"{written} cannot be written ({error}){kept}") from error
+    # Written to the end, as no checkpoint holds the last samples.
+    with deferred_interrupt() as pressed:
+        try:
+            if _is_spectral(path):
+                with stage("writing"):
+                    image.save(path, **stored)
+            with stage("preview"):
+                clean = partial(denoised_picture, scenes[0]) if scenes else None
+                exposure = save_preview(image, preview, exposure, clean, view)
+        except (OSError, RuntimeError) as error:
+            kept = f"; {checkpoint} is kept, and --resume continues from it" if checkpoint.exists() else ""
+            written = f"{path} or its preview" if _is_spectral(path) else str(path)
+            raise RuntimeError(f"{written} cannot be written ({error}){kept}") from error
     if interrupted:
         spp = image.attributes["spp"]
         raise Stopped(f"{path} holds {spp} samples per pixel; the same command with --resume continues")
@@ -347,6 +350,8 @@ def _picture(
         f"{time.perf_counter() - start:.1f} s, {bytes_text(path.stat().st_size)}"
         + (f"\n{preview}: preview, {exposed}" if _is_spectral(path) else f", {exposed}")
     )
+    if pressed():
+        raise Stopped(f"{path} is complete")
     return exposure
 
 

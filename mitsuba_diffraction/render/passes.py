@@ -272,7 +272,7 @@ def _trace(
     spent, before, expected = 0.0, 0.0, 0.0
     complete = _is_complete(sums, job, progress)
     last_checkpoint, interval = time.monotonic(), seconds
-    with _deferred_interrupt() as interrupted, closing(tracer(job, scene, sums.done)) as traced:
+    with deferred_interrupt() as interrupted, closing(tracer(job, scene, sums.done)) as traced:
         while not (complete or interrupted()):
             with stage("kernels and first pass" if sums.done == first else "rendering"):
                 sums.add(next(traced))
@@ -431,28 +431,33 @@ def _is_complete(sums: BandedSums, job: Job, progress: Callable[[float, float, f
 
 
 @contextmanager
-def _deferred_interrupt() -> Iterator[Callable[[], bool]]:
+def deferred_interrupt() -> Iterator[Callable[[], bool]]:
     """Yield a function that returns whether Ctrl-C was pressed; a second one interrupts at once.
 
-    An exception between two statements could make the sums inconsistent with their count. Python handles signals only
-    in the main thread. If SIGINT is ignored, as in background jobs of a script, it stays ignored.
+    An exception between two statements could make the sums inconsistent with their count. Where SIGTERM interrupts like
+    Ctrl-C, as in a command, it is deferred alike. Python handles signals only in the main thread. Signals that are
+    ignored, as SIGINT in background jobs of a script, stay ignored.
     """
-    before = signal.getsignal(signal.SIGINT)
-    if threading.current_thread() is not threading.main_thread() or before in (signal.SIG_IGN, None):
-        yield lambda: False
-        return
+    before = {number: signal.getsignal(number) for number in (signal.SIGINT, signal.SIGTERM)}
+    handlers = {number: handler for number, handler in before.items() if callable(handler)}
+    if threading.current_thread() is not threading.main_thread():
+        handlers = {}
     pressed = threading.Event()
     # The handler of the command line has already raised an exception, which other code has suppressed.
-    if getattr(before, "pressed", False):
+    if any(getattr(handler, "pressed", False) for handler in handlers.values()):
         pressed.set()
+
+    def restore() -> None:
+        for number, handler in handlers.items():
+            signal.signal(number, handler)
 
     def on_first_press(number: int, frame: object) -> None:
         pressed.set()
-        signal.signal(signal.SIGINT, before)
+        restore()
 
-    signal.signal(signal.SIGINT, on_first_press)
+    for number in handlers:
+        signal.signal(number, on_first_press)
     try:
         yield pressed.is_set
-
     finally:
-        signal.signal(signal.SIGINT, before)
+        restore()

@@ -21,6 +21,7 @@ import mitsuba_diffraction as md
 from mitsuba_diffraction.cli import _CtrlC, main
 from mitsuba_diffraction.cli.arguments import scene_parameters
 from mitsuba_diffraction.errors import RequestError
+from mitsuba_diffraction.precomputation.recipe import Recipe
 from mitsuba_diffraction.progress import log_lines
 from mitsuba_diffraction.render.scene_file import SceneFile
 from mitsuba_diffraction.render.spectral_image import SpectralImage
@@ -620,14 +621,15 @@ def test_an_interrupt_inside_a_plugin_is_not_blamed_on_the_scene(command):
     assert signal.getsignal(signal.SIGINT) is before
 
 
-def test_an_interrupt_swallowed_by_the_loader_ends_the_rendering(command, monkeypatch):
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+def test_an_interrupt_swallowed_by_the_loader_ends_the_rendering(command, monkeypatch, number):
     """As C++ code and the garbage collector may do while the scene is loaded."""
 
     load = SceneFile.load
 
     def ignoring(*args, **kwargs):
         with contextlib.suppress(KeyboardInterrupt):
-            signal.raise_signal(signal.SIGINT)
+            signal.raise_signal(number)
         return load(*args, **kwargs)
 
     monkeypatch.setattr(SceneFile, "load", ignoring)
@@ -638,9 +640,19 @@ def test_an_interrupt_swallowed_by_the_loader_ends_the_rendering(command, monkey
     assert not Path("scene.exr").exists()
 
 
-def test_an_interrupt_during_an_import_waits_for_its_end(monkeypatch):
+def test_sigterm_interrupts_precompute(command, monkeypatch):
+    def end(*arguments):
+        signal.raise_signal(signal.SIGTERM)
+
+    monkeypatch.setattr(Recipe, "build", end)
+    code, out, err = command("precompute blazed -o blazed.exr")
+    assert (code, out, err) == (130, "", "mitsuba-diffraction: interrupted: nothing was written\n")
+
+
+@pytest.mark.parametrize("name", ["SIGINT", "SIGTERM"])
+def test_an_interrupt_during_an_import_waits_for_its_end(monkeypatch, name):
     # Regression: while Mitsuba was imported, which creates enumerations in Python, Ctrl-C aborted the process.
-    press = "signal.raise_signal(signal.SIGINT)"
+    press, number = f"signal.raise_signal(signal.{name})", getattr(signal, name)
     Path("interrupted.py").write_text(f"import signal, time\n{press}; time.sleep(0.03); {press}\ncomplete = True\n")
     monkeypatch.syspath_prepend(".")
 
@@ -649,13 +661,13 @@ def test_an_interrupt_during_an_import_waits_for_its_end(monkeypatch):
         for _ in range(1000):
             time.sleep(0.01)
 
-    before = signal.signal(signal.SIGINT, _CtrlC())
+    before = signal.signal(number, _CtrlC())
     try:
         with pytest.raises(KeyboardInterrupt):
             work()
         time.sleep(0.2)  # once, although it was pressed twice
     finally:
-        signal.signal(signal.SIGINT, before)
+        signal.signal(number, before)
     assert sys.modules.pop("interrupted").complete
 
 

@@ -63,13 +63,13 @@ def stop_after(count):
     return trace
 
 
-def press_ctrl_c(monkeypatch, count):
+def press_ctrl_c(monkeypatch, count, number_of_signal=signal.SIGINT):
     """Lets the command be interrupted in its pass number `count`."""
     original, number = passes.trace_pass, itertools.count(1)
 
     def trace_pass(*arguments):
         if next(number) == count:
-            signal.raise_signal(signal.SIGINT)
+            signal.raise_signal(number_of_signal)
         return original(*arguments)
 
     monkeypatch.setattr(passes, "trace_pass", trace_pass)
@@ -179,6 +179,7 @@ def test_ctrl_c_saves_the_picture_so_far_and_resuming_gives_the_same_bits():
     np.testing.assert_array_equal(resumed.radiance, whole.radiance)
     assert resumed.attributes == whole.attributes
     assert signal.getsignal(signal.SIGINT) is signal.default_int_handler
+    assert signal.getsignal(signal.SIGTERM) is signal.SIG_DFL
 
 
 def test_a_second_ctrl_c_does_not_wait():
@@ -438,10 +439,10 @@ def test_the_command_is_interrupted_and_goes_on(command, monkeypatch):
     assert Path("out.exr").stat().st_mtime_ns == written
 
 
-@pytest.mark.parametrize("name", ["out.png", "out.jpg"])
-def test_a_picture_alone_is_interrupted_and_goes_on(command, monkeypatch, name):
+@pytest.mark.parametrize(("name", "number"), [("out.png", signal.SIGINT), ("out.jpg", signal.SIGTERM)])
+def test_a_picture_alone_is_interrupted_and_goes_on(command, monkeypatch, name, number):
     line = f"{RENDER} -o {name} --spp 4"
-    press_ctrl_c(monkeypatch, 2)
+    press_ctrl_c(monkeypatch, 2, number)
     code, out, err = command(line)
     assert (code, out) == (130, "")
     assert f"interrupted: {name} holds 2 samples per pixel; the same command with --resume continues" in err
@@ -458,6 +459,20 @@ def test_a_picture_alone_is_interrupted_and_goes_on(command, monkeypatch, name):
     written = Path(name).stat().st_mtime_ns
     assert command(f"{line} --resume")[:2] == (0, f"{name}: complete, nothing to do\n")
     assert Path(name).stat().st_mtime_ns == written
+
+
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+def test_a_picture_that_is_being_written_is_completed(command, monkeypatch, number):
+    save = SpectralImage.save
+
+    def press_and_save(*arguments, **options):
+        signal.raise_signal(number)
+        save(*arguments, **options)
+
+    monkeypatch.setattr(SpectralImage, "save", press_and_save)
+    assert command(LINE)[::2] == (130, "mitsuba-diffraction: interrupted: out.exr is complete\n")
+    assert files() == {"scene.xml", "out.exr", "out.png"}
+    assert command(f"{LINE} --resume")[:2] == (0, "out.exr: complete, nothing to do\n")
 
 
 @pytest.mark.parametrize("name", ["out.exr", "out.png"])
@@ -661,7 +676,7 @@ def test_the_orbit_takes_any_xml_that_mitsuba_takes():
 
 def test_a_turntable_writes_frames_and_an_animation_and_resumes(command, monkeypatch):
     line = f"{RENDER} -o out.exr --float --frames 3 --orbit --spp 2"
-    press_ctrl_c(monkeypatch, 3)
+    press_ctrl_c(monkeypatch, 3, signal.SIGTERM)
     code, _, err = command(line)
     assert code == 130
     assert "out_001.exr holds 1 samples per pixel; the same command with --resume continues" in err
