@@ -3,6 +3,7 @@
 import gc
 import os
 import shlex
+import shutil
 import signal
 import sys
 import warnings
@@ -106,6 +107,36 @@ def ctrl_c():
     before = signal.signal(signal.SIGINT, signal.default_int_handler)
     yield
     signal.signal(signal.SIGINT, before)
+
+
+@pytest.fixture(scope="session")
+def small_scenes(tmp_path_factory):
+    """The folder of scenes beside that of recipes, with models of few texels."""
+    root, repository = tmp_path_factory.mktemp("root"), Path(__file__).parents[1]
+    scenes = root / "scenes"
+    shutil.copytree(repository / "scenes", scenes, ignore=shutil.ignore_patterns("models", "__pycache__"))
+    shutil.copytree(repository / "precompute", root / "precompute")
+    with pytest.MonkeyPatch.context() as patch:
+        patch.syspath_prepend(str(repository / "scenes"))
+        import anodised
+        import beetle
+        import disc
+        import foil
+        import ground
+        import hologram
+        import snake
+        import street
+    models = scenes / "models"
+    models.mkdir()
+    snake.make(models, columns=640)
+    disc.make(models, count=64)
+    foil.make(models, count=60)
+    ground.make(models, size=256)
+    hologram.make(models, columns=32)
+    anodised.make(models, columns=64)
+    beetle.make(models, columns=90)
+    street.make(models)
+    return scenes
 
 
 @pytest.fixture

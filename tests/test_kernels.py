@@ -6,16 +6,23 @@ import functools
 import gc
 import re
 from collections.abc import Callable
+from concurrent.futures import ProcessPoolExecutor
 from itertools import pairwise
+from multiprocessing import get_context
+from pathlib import Path
 
 import drjit as dr
 import mitsuba as mi
 import numpy as np
 import pytest
-from bsdf_support import WAVELENGTHS, made_up, of_spectrum, random_directions, spectrum, uniform
+from bsdf_support import WAVELENGTHS, bitmap, made_up, of_spectrum, random_directions, spectrum, uniform
 
 import mitsuba_diffraction as md
 from mitsuba_diffraction.bsdf.testing import array, direction, floats, interaction, vectors
+from mitsuba_diffraction.integrator.paths import unpacked
+from mitsuba_diffraction.render.scene_file import SceneFile
+from mitsuba_diffraction.render.trace_pass import trace_pass
+from mitsuba_diffraction.surface.gratings import PROFILES
 
 pytestmark = pytest.mark.usefixtures("llvm")
 WI = direction(25.0, 40.0)
@@ -99,6 +106,77 @@ def test_a_bsdf_computes_in_single_precision(name):
 def test_an_integrator_computes_in_single_precision(integrator):
     built = scene(BLAZE, integrator)
     assert without_double(kernels(lambda: dr.eval(mi.render(built, spp=1))))
+
+
+def frames_of(load: Callable[[], mi.Scene], seeds: range, traces: Callable = mi.render) -> list[dict[str, str]]:
+    """The kernels of each frame of a scene, by their names."""
+    built, frames = load(), []
+    for seed in seeds:
+        history = kernels(lambda: dr.eval(traces(built, spp=2, seed=seed)))  # noqa: B023
+        frames.append({kernel["hash"]: kernel["ir"].getvalue() for kernel in history})
+    return frames
+
+
+def test_later_frames_and_loads_have_the_kernels_of_the_first_frame():
+    """Also in the order of their tables: none reads what NumPy or the order of loading places by chance."""
+    described = md.example_scene("blazed", size=8, conserve_energy=False)
+    first, *later = [frame for _ in range(3) for frame in frames_of(lambda: mi.load_dict(described), range(2))]
+    assert not any(re.search(r"load <?[\w ]*(float|i32).*align 1,", text) for text in first.values())
+    assert all(frame.keys() <= first.keys() for frame in later)
+
+
+@pytest.mark.parametrize("count", [0, 1])
+def test_few_contributions_from_the_light_have_the_kernels_of_many(count):
+    found, expected = (
+        kernels(lambda: dr.eval(unpacked(np.ones((n, 2 + 2 * dr.size_v(mi.Spectrum)), np.float32))[0] + 1))  # noqa: B023
+        for n in (count, 5)
+    )
+    assert [kernel["hash"] for kernel in found] == [kernel["hash"] for kernel in expected]
+
+
+def load_named(folder: Path, name: str) -> mi.Scene:
+    """A small scene: one of the folder with its parameters, a profile or a kind of grating."""
+    mi.set_variant("llvm_ad_spectral")
+    if name in (kinds := {**GRATINGS, **FURTHER_KINDS}):
+        return scene(kinds[name](), "diffraction_path")
+    if name in PROFILES:
+        return mi.load_dict(md.example_scene(name, size=16))
+    words = name.split()
+    return SceneFile(folder / f"{words[0]}.xml", dict(word.split("=") for word in words[1:]), size=(16, None)).load()
+
+
+def kernels_of_two_ways(folder: Path, name: str) -> list[set[str]]:
+    """The names of the kernels of five frames by `mi.render`, and of five passes of `render`."""
+    ways = (mi.render,) if name in (*GRATINGS, *FURTHER_KINDS, *PROFILES) else (mi.render, trace_pass)
+    return [set(frame) for way in ways for frame in frames_of(lambda: load_named(folder, name), range(5), way)]
+
+
+FURTHER_KINDS = {
+    "patches": lambda: {"type": "diffraction_grating", "profile": "elaphe_synthetic", "material": "Al"},
+    "films": lambda: {**BLAZE, "material": "Ti", "thin_film_thickness": "0.08, 0.05", "thin_film_ior": "2.4, 1.5"},
+    "textures": lambda: {
+        **BLAZE,
+        "height_scale": bitmap([[0.5, 1.0], [0.8, 0.6]], raw=True),
+        "orientation": bitmap([[0.0, 90.0]], raw=True),
+    },
+}
+NAMED = ["blaze", "elaphe", "screen", "xenopeltis_sphere", "spectrometer", "spectroscope"]
+NAMED += [f"snake skin=xenopeltis light={light}" for light in ("sun", "lamps")] + ["snake skin=elaphe light=sun"]
+NAMED += [f"{name} light={light}" for name in ("compact_disc", "foil") for light in ("sun", "desk_lamp")]
+NAMED += ["hologram", "hologram card=clear", "anodised", "beetle", "rainbow", "window", "glasses", "projection"]
+NAMED += [*GRATINGS, *FURTHER_KINDS, "compact_disc", "dvd", "blazed", "xenopeltis_synthetic"]
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", NAMED)
+def test_another_process_has_the_kernels_of_the_first_frame(name, small_scenes):
+    """So that it finds them compiled."""
+    found = []
+    for _ in range(2):
+        with ProcessPoolExecutor(1, get_context("spawn")) as process:
+            found.append(process.submit(kernels_of_two_ways, small_scenes, name).result())
+    for way in range(0, len(found[0]), 5):
+        assert all(frame <= found[0][way] for process in found for frame in process[way : way + 5])
 
 
 def test_loading_a_scene_again_compiles_nothing():

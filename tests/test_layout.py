@@ -215,6 +215,89 @@ def test_the_manual_names_files_and_code_that_exist():
                 assert name.rpartition(".")[2] in words, f"{page.name}: {name}"
 
 
+_OF_PYTHON = {"item", "tobytes", "tolist"}  # methods whose results are no arrays
+
+
+def arrays_mapped_from_numpy(program):
+    """The calls that make an array of Dr.Jit of one of NumPy, as far as each function shows what is one."""
+    for function in ast.walk(ast.parse(program)):
+        if isinstance(function, ast.FunctionDef):
+            names = names_of_numpy_arrays(function)
+            for node in ast.walk(function):
+                if makes_array(node) and any(is_numpy_array(argument, names) for argument in node.args):
+                    yield ast.unparse(node)
+
+
+def makes_array(node):
+    """Whether a node is `mi.Float(…)`, `mi.Point2f(…)` and the like, `type(x)(…)` or `kind(…)`."""
+    match node:
+        case ast.Call(func=ast.Attribute(value=ast.Name("mi"), attr=name)):
+            return name[0].isupper() and not name.startswith(("Bitmap", "Scalar", "Struct"))
+        case ast.Call(func=ast.Call(func=ast.Name("type")) | ast.Name("kind")):
+            return True
+    return False
+
+
+def names_of_numpy_arrays(function):
+    """The names of arrays of NumPy in a function, and of what it unpacks from them."""
+    arguments = [node for node in ast.walk(function.args) if isinstance(node, ast.arg) and node.annotation]
+    names = {node.arg for node in arguments if re.search("NDArray|ndarray|ArrayLike", ast.unparse(node.annotation))}
+    bindings = []
+    for node in ast.walk(function):
+        if isinstance(node, ast.Assign):
+            bindings += [(target, node.value) for target in node.targets]
+        elif isinstance(node, ast.For | ast.comprehension):
+            bindings.append((node.target, node.iter))
+    for _ in range(3):
+        for target, value in bindings:
+            pairs = [(target, value)]
+            if isinstance(target, ast.Tuple) and isinstance(value, ast.Tuple):
+                pairs = zip(target.elts, value.elts, strict=False)
+            for one, of_one in pairs:
+                if is_numpy_array(of_one, names):
+                    names |= {name.id for name in ast.walk(one) if isinstance(name, ast.Name)}
+    return names
+
+
+def is_numpy_array(node, names):
+    match node:
+        case ast.Name():
+            return node.id in names
+        case ast.Call(func=ast.Attribute(value=owner, attr=method)):
+            of_numpy = isinstance(owner, ast.Name) and owner.id == "np"
+            return of_numpy or (method not in _OF_PYTHON and is_numpy_array(owner, names))
+        case ast.Attribute(value=owner, attr=part):
+            return part in ("T", "real", "imag") and is_numpy_array(owner, names)
+        case ast.Subscript(value=owner) | ast.Starred(value=owner):
+            return is_numpy_array(owner, names)
+        case ast.BinOp() | ast.UnaryOp() | ast.IfExp() | ast.GeneratorExp() | ast.ListComp():
+            return any(is_numpy_array(child, names) for child in ast.iter_child_nodes(node))
+    return False
+
+
+@pytest.mark.quick
+def test_arrays_mapped_from_numpy_are_found():
+    for lines in (
+        "mi.Float(np.array([1.0]))",
+        "table = np.zeros(3)\ntable[1] = 2\nself.table = mi.UInt32(table.ravel())",
+        "x, y = (values / 2), 1\nmi.Point2f(x.astype(np.float32), y)",
+        "mi.Vector3f(values.T)",
+        "x, *rgb = (mi.Float(column) for column in values.T)",
+        "si.wavelengths = type(si.wavelengths)(2 * values)",
+    ):
+        body = textwrap.indent(f"{lines}\nx = mi.Float(float(np.sqrt(2)), values.tolist(), on_device(values))", "    ")
+        assert len(list(arrays_mapped_from_numpy(f"def f(values: NDArray):\n{body}"))) == 1, lines
+
+
+@pytest.mark.quick
+def test_one_function_makes_arrays_of_dr_jit_from_those_of_numpy():
+    """Kernels that read the memory of NumPy differ by its address, and are compiled again by other processes."""
+    texts = {module: path.read_text(encoding="utf-8") for module, path in MODULES.items()}
+    texts = {module: text for module, text in texts.items() if "import mitsuba as mi" in text}
+    found = {f"{module}: {call}" for module, text in texts.items() for call in arrays_mapped_from_numpy(text)}
+    assert found == {"mitsuba_diffraction.bsdf.device_tables: kind(memory)"}
+
+
 def test_nothing_depends_on_what_judges_the_product():
     judges = "mitsuba_diffraction.evaluation", "mitsuba_diffraction.shader_2014"
     for module in MODULES:

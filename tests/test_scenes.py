@@ -26,15 +26,11 @@ ROOT = Path(__file__).parents[1]
 SCENES = ROOT / "scenes"
 sys.path.insert(0, str(SCENES))
 
-import anodised  # noqa: E402
 import beetle  # noqa: E402
-import disc  # noqa: E402
 import foil  # noqa: E402
 import ground  # noqa: E402
-import hologram  # noqa: E402
 import modelling  # noqa: E402
 import snake  # noqa: E402
-import street  # noqa: E402
 
 
 def check(image, width, height):
@@ -148,26 +144,6 @@ def test_a_picture_is_a_texture_on_one_core(llvm, tmp_path):
 
 
 # ---------------------------------------------------------------- scenes with models
-
-
-@pytest.fixture(scope="module")
-def small_scenes(tmp_path_factory):
-    """The folder of scenes beside that of recipes, with models of few texels."""
-    root = tmp_path_factory.mktemp("root")
-    scenes = root / "scenes"
-    shutil.copytree(SCENES, scenes, ignore=shutil.ignore_patterns("models", "__pycache__"))
-    shutil.copytree(ROOT / "precompute", root / "precompute")
-    models = scenes / "models"
-    models.mkdir()
-    snake.make(models, columns=640)
-    disc.make(models, count=64)
-    foil.make(models, count=60)
-    ground.make(models, size=256)
-    hologram.make(models, columns=32)
-    anodised.make(models, columns=64)
-    beetle.make(models, columns=90)
-    street.make(models)
-    return scenes
 
 
 PICTURES = [

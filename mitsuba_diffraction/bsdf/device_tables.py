@@ -1,4 +1,7 @@
-"""Tables that Dr.Jit gathers from, and minimum, maximum and integer part in few instructions.
+"""Arrays of Dr.Jit from numbers, tables that it gathers from, and minimum, maximum and integer part.
+
+Every array that a kernel reads is made by `on_device` or `opaque`: Dr.Jit maps the memory of a NumPy array, and its
+address enters the text of the kernel, which is then compiled again in another process.
 
 `dr.maximum` and `dr.minimum` follow IEEE 754 for NaN and signed zeros, which takes LLVM several instructions; a
 comparison and a selection take one each. Here a comparison with NaN is false.
@@ -11,6 +14,7 @@ from typing import Any
 import drjit as dr
 import mitsuba as mi
 import numpy as np
+from numpy.typing import ArrayLike
 
 from ..spectrum.tables import MIN_EXPONENT
 
@@ -40,9 +44,21 @@ def integer_part(x: mi.Float) -> mi.UInt32:
 
 def opaque(value: float) -> mi.Float:
     """Return a number as an opaque array instead of a literal, so that all surfaces have the same kernel."""
-    result = mi.Float(value)
-    dr.make_opaque(result)
-    return result
+    return dr.opaque(mi.Float, float(value))
+
+
+def on_device(values: ArrayLike, kind: type | None = None) -> Any:
+    """Return a flat array of Dr.Jit, in aligned memory of its own, with the numbers of any array.
+
+    Args:
+        values: of any shape.
+        kind: of Dr.Jit; default: `mi.Float`.
+    """
+    kind, numbers = kind or mi.Float, np.ravel(values)
+    result = dr.empty(kind, numbers.size)
+    memory = np.asarray(result)  # that of Dr.Jit on processors; of arrays on a GPU a copy
+    memory[...] = numbers
+    return result if dr.backend_v(kind) == dr.JitBackend.LLVM else kind(memory)
 
 
 BELOW_ONE = 1 - 2.0**-24  # the largest float32 under one, in every variant
@@ -53,9 +69,8 @@ class NumberTable:
 
     def __init__(self, numbers: np.ndarray) -> None:
         """Flatten an array; numbers other than uint32 and float16 are converted to float32."""
-        kind = numbers.dtype if numbers.dtype in (np.uint32, np.float16) else np.float32
-        self.number = {np.uint32: mi.UInt32, np.float16: mi.Float16, np.float32: mi.Float}[np.dtype(kind).type]
-        self.values = self.number(aligned(np.asarray(numbers, kind).ravel()))
+        self.number = {np.uint32: mi.UInt32, np.float16: mi.Float16}.get(numbers.dtype.type, mi.Float)
+        self.values = on_device(numbers, self.number)
 
     def __call__(self, index: mi.UInt32, active: mi.Bool = True) -> mi.Float | mi.UInt32:
         """Return the numbers at `index`; zero where not `active`."""
@@ -87,19 +102,6 @@ class PacketTable(NumberTable):
         return super().__call__(self.width * index + component, active)
 
 
-def aligned(values: np.ndarray) -> np.ndarray:
-    """Return flat numbers at an address that is a multiple of 64 bytes.
-
-    Dr.Jit uses the memory of NumPy arrays without copying, and gathers whole packets only from aligned memory: without
-    alignment kernels would be slower, and differ from one allocation to the next.
-    """
-    memory = np.empty(values.nbytes + 64, np.uint8)
-    start = -memory.ctypes.data % 64
-    result = memory[start : start + values.nbytes].view(values.dtype)
-    result[:] = values
-    return result
-
-
 class SharedExponentTable:
     """A flat table of packets of three numbers in a word of 32 bits: nine bits for each and five for one exponent.
 
@@ -112,7 +114,7 @@ class SharedExponentTable:
         """Pack the numbers m 2^e, m (..., 3) and e (...)."""
         m = mantissas.astype(np.int64) & 511
         words = (m[..., 0] << 23) | (m[..., 1] << 14) | (m[..., 2] << 5) | (exponents - MIN_EXPONENT + 1)
-        self.words = mi.UInt32(aligned(words.astype(np.uint32).ravel()))
+        self.words = on_device(words, mi.UInt32)
 
     def add(self, packet: mi.Vector3f, weight: mi.Float, index: mi.UInt32, active: mi.Bool) -> mi.Vector3f:
         """Return `packet` plus `weight` times the packet at `index`."""
@@ -140,7 +142,7 @@ class ProbabilityTable:
         self.values = np.ldexp(mantissas, exponents[..., None]).astype(np.float32)
         m = mantissas.astype(np.int64)
         words = (m[..., 0] << 26) | (m[..., 1] << 20) | (m[..., 2] << 14) | (m[..., 3] << 8) | (exponents + 127)
-        self.words = mi.UInt32(aligned(words.astype(np.uint32).ravel()))
+        self.words = on_device(words, mi.UInt32)
 
     def block(self, index: mi.UInt32, component: mi.UInt32, active: mi.Bool) -> mi.Vector4f:
         """Return one component of the four packets from 4 · `index`; zero where not `active`."""

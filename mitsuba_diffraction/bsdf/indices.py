@@ -22,7 +22,7 @@ from ..optics.materials import (
 )
 from ..settings import VISIBLE
 from .base import nested_plugin, parts
-from .device_tables import PacketTable, integer_part, limited, opaque
+from .device_tables import PacketTable, integer_part, limited, on_device, opaque
 
 MAX_INDEX_NODES = 200_000  # 1 nm apart for tables that end at 200 µm
 _TRIED = 32  # points along u and v, at least, at which a texture of an index is checked
@@ -146,10 +146,11 @@ def check_spectra(eta: mi.Texture, k: mi.Texture, *known: KnownRange) -> None:
         count = int(np.prod(shape))
     index = np.arange(count)
     si = dr.zeros(mi.SurfaceInteraction3f, count)
-    si.uv = mi.Point2f((index % shape[0] + 0.5) / shape[0], (index // shape[0] % shape[1] + 0.5) / shape[1])
+    u, v = (index % shape[0] + 0.5) / shape[0], (index // shape[0] % shape[1] + 0.5) / shape[1]
+    si.uv = mi.Point2f(on_device(u), on_device(v))
     # In an order that has nothing to do with the pixels, and between the ends, where tables are black.
     fraction = (index + 0.5) / count if shape == (1, 1) else (index * 0.6180339887 + 0.5) % 1
-    si.wavelengths = type(si.wavelengths)(mi.Float(first + (last - first) * fraction))
+    si.wavelengths = type(si.wavelengths)(on_device(first + (last - first) * fraction))
     size: float | np.ndarray = 0.0
     for name, texture in (("eta", eta), ("k", k)):
         values = np.array(dr.detach(texture.eval(si)[0]))

@@ -10,6 +10,7 @@ from ..errors import RequestError
 from ..settings import VISIBLE
 from ..variants import is_supported
 from .base import gratings_in, parts
+from .device_tables import on_device
 
 STEP = 0.25  # nm, less than the width of lines
 
@@ -101,5 +102,5 @@ def _at_wavelengths(low: float, high: float) -> mi.SurfaceInteraction3f:
     """Return interactions at wavelengths spread over [low, high] nm."""
     wavelengths = np.arange(low + STEP / 2, high, STEP)
     si = dr.zeros(mi.SurfaceInteraction3f, wavelengths.size)
-    si.wavelengths = type(si.wavelengths)(mi.Float(wavelengths.astype(np.float32)))
+    si.wavelengths = type(si.wavelengths)(on_device(wavelengths))
     return si

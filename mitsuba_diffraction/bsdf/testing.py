@@ -10,7 +10,7 @@ from numpy.typing import ArrayLike, NDArray
 from ..array_types import Real
 from ..errors import RequestError
 from ..variants import is_supported
-from .device_tables import aligned
+from .device_tables import on_device
 
 
 def direction(theta: ArrayLike, phi: ArrayLike = 0.0) -> Real:
@@ -35,13 +35,8 @@ def vectors(omega: ArrayLike) -> mi.Vector3f:
 
 
 def floats(values: ArrayLike) -> mi.Float:
-    """Convert (n,) or a number to floats of Mitsuba.
-
-    The copy is neither a literal nor NumPy's own memory, so that the next call reuses the kernel.
-    """
-    result = mi.Float(aligned(np.atleast_1d(np.asarray(values, np.float32))))
-    dr.make_opaque(result)
-    return result
+    """Convert (n,) or a number to floats of Mitsuba."""
+    return on_device(values)
 
 
 def array(value: object, dtype: type | None = None) -> NDArray:

@@ -32,7 +32,7 @@ import mitsuba as mi
 import numpy as np
 
 from ..bsdf.base import gratings_in, is_grating, parts
-from ..bsdf.device_tables import BELOW_ONE, opaque
+from ..bsdf.device_tables import BELOW_ONE, on_device, opaque
 from ..precomputation.grating_spectrum import GratingSpectrum
 from ..precomputation.spectra import Spectrum
 from ..spectrum.grids import OrderGrid
@@ -48,6 +48,31 @@ _DIRECTIONS = 2**15  # for this comparison
 _LATTICE = (0.7548776662466927, 0.5698402909980532)
 
 
+class MetEmitters:
+    """The emitters that rays meet, as `si.emitter(scene)` returns them.
+
+    The environment is an opaque number. Mitsuba's is a literal, which depends on the order in which threads load lamps:
+    the same scene would have several kernels.
+    """
+
+    def __init__(self, scene: mi.Scene) -> None:
+        self._environment = mi.EmitterPtr(scene.environment())
+        if scene.environment() is not None:
+            dr.make_opaque(self._environment)
+
+    def at(self, si: mi.SurfaceInteraction3f) -> mi.EmitterPtr:
+        """Return the emitter that a ray meets."""
+        return dr.select(si.is_valid(), si.shape.emitter(), self._environment)
+
+    def towards(
+        self, scene: mi.Scene, si: mi.SurfaceInteraction3f, origin: mi.SurfaceInteraction3f
+    ) -> mi.DirectionSample3f:
+        """Return the direction from a point to what a ray from there meets."""
+        ds = mi.DirectionSample3f(scene, si, origin)
+        ds.emitter = self.at(si)
+        return ds
+
+
 class Candidates:
     """Direct light at the gratings of a scene.
 
@@ -56,15 +81,18 @@ class Candidates:
         any: whether candidates are drawn on any of the shapes.
     """
 
-    def __init__(self, scene: mi.Scene, shapes: list[mi.Shape], instanced: list[mi.Shape]) -> None:
+    def __init__(
+        self, scene: mi.Scene, emitters: MetEmitters, shapes: list[mi.Shape], instanced: list[mi.Shape]
+    ) -> None:
         """Choose J of all gratings.
 
         Args:
             scene: with lights.
+            emitters: of the scene.
             shapes: on which points can be drawn.
             instanced: of groups, whose instances are in the scene.
         """
-        self.light = UnshadowedLight(scene)
+        self.emitters, self.light = emitters, UnshadowedLight(scene)
         u = _random(0)
         points = {shape: shape.sample_position(0.0, mi.Point2f(u.x, u.y)).p for shape in shapes}
         points |= dict.fromkeys(instanced, _points_of_instances(scene, u) if instanced else None)
@@ -81,7 +109,7 @@ class Candidates:
             if not any(bsdf is known for known in self._bsdfs):
                 self._bsdfs.append(bsdf)
             table[row] = slots[shape], next(k for k, known in enumerate(self._bsdfs) if bsdf is known)
-        self._table = mi.UInt32(table.ravel())
+        self._table = on_device(table, mi.UInt32)
         self._fraction = opaque(DEFENSIVE_FRACTION)
 
     def _slots(self, scene: mi.Scene, shape: mi.Shape, points: mi.Point3f) -> int:
@@ -142,7 +170,7 @@ class Candidates:
             value, pdf = bsdf.eval_pdf(ctx, si, omega, kept)
             kept &= dr.any(value != 0)
             found = scene.ray_intersect(si.spawn_ray(si.to_world(omega)), kept)
-            ds = mi.DirectionSample3f(scene, found, si)
+            ds = self.emitters.towards(scene, found, si)
             pdf_emitter = scene.pdf_emitter_direction(si, ds, kept)
             emitted = ds.emitter.eval(found, kept)
             # c/(M π)
@@ -202,7 +230,7 @@ def _points_of_instances(scene: mi.Scene, u: mi.Point3f) -> mi.Point3f:
     """Map points of the unit cube to the boxes around all instances, as Mitsuba does not draw points on them."""
     boxes = [shape.bbox() for shape in scene.shapes() if shape.class_name() == "Instance"]
     low, high = (
-        mi.Point3f(np.array(corners, np.float32).T)
+        mi.Point3f(*map(on_device, np.array(corners).T))
         for corners in zip(*((box.min, box.max) for box in boxes), strict=True)
     )
     which = dr.arange(mi.UInt32, _DIRECTIONS) % len(boxes)

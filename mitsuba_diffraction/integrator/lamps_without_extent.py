@@ -23,7 +23,7 @@ import mitsuba as mi
 import numpy as np
 from numpy.typing import NDArray
 
-from ..bsdf.device_tables import BELOW_ONE, opaque, smaller
+from ..bsdf.device_tables import BELOW_ONE, on_device, opaque, smaller
 
 _PACKETS = 4  # K/4
 
@@ -102,9 +102,9 @@ class Emitters:
         if not self.any:
             return
         self.probability = opaque(probabilities.sum())
-        self._choice = mi.DiscreteDistribution(probabilities.astype(np.float32))
-        self._first = mi.Float((np.cumsum(all_of_them) - all_of_them)[chosen].astype(np.float32))
-        self._range = mi.Float(probabilities.astype(np.float32))
+        self._choice = mi.DiscreteDistribution(on_device(probabilities))
+        self._first = on_device((np.cumsum(all_of_them) - all_of_them)[chosen])
+        self._range = on_device(probabilities)
 
     def of(self, point: mi.Point2f, active: mi.Bool) -> mi.Point2f:
         """Return the numbers for which `sample_emitter_direction` of the scene draws one of them."""

@@ -14,7 +14,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..bsdf.base import gratings_in, is_grating, parts
-from .candidates import Candidates
+from ..bsdf.device_tables import on_device
+from .candidates import Candidates, MetEmitters
 from .lamps_without_extent import LampsWithoutExtent
 
 
@@ -57,9 +58,9 @@ class Gratings:
             return
         kinds = [2 if _is_grating_only(shape.bsdf()) else 1 for shape in self.shapes] + [3] * len(self.instanced)
         self._size = dr.opaque(mi.UInt32, max(ids) + 1)
-        self._table = dr.zeros(mi.UInt32, max(ids) + 1)
-        dr.scatter(self._table, mi.UInt32(kinds), mi.UInt32(ids))
-        dr.eval(self._table)
+        table = np.zeros(max(ids) + 1)
+        table[ids] = kinds
+        self._table = on_device(table, mi.UInt32)
 
     def __contains__(self, shape: mi.Shape) -> bool:
         return any(shape is grating for grating in self.shapes)
@@ -139,7 +140,8 @@ def define_eye_paths() -> type:
         ) -> None:
             mi.SamplingIntegrator.__init__(self, mi.Properties("eye_paths"))
             self.gratings = gratings
-            self.candidates = Candidates(scene, gratings.shapes, gratings.instanced)
+            self.emitters = MetEmitters(scene)
+            self.candidates = Candidates(scene, self.emitters, gratings.shapes, gratings.instanced)
             self.lamps = LampsWithoutExtent(scene, sensor)
             # Whether L G X G E and L G X M E are short enough: a literal, which removes what serves them alone.
             self.guides = bool(gratings.shapes) and not 0 <= max_depth < 4
@@ -182,7 +184,7 @@ def define_eye_paths() -> type:
             si = scene.ray_intersect(ray, active)
             # Alpha is the same as in `path`: null interactions are transparent, an environment is not.
             valid = mi.Bool(scene.environment() is not None)
-            result = si.emitter(scene).eval(si, active)
+            result = self.emitters.at(si).eval(si, active)
             ray, ray_wavelengths = mi.Ray3f(ray), mi.Spectrum(ray.wavelengths)
             throughput, eta = mi.Spectrum(1.0), mi.Float(1.0)
             depth = mi.UInt32(1)
@@ -250,7 +252,7 @@ def define_eye_paths() -> type:
                 has_scattered |= ~delta
                 ray = si.spawn_ray(dr.select(guided, to_point.d, si.to_world(bs.wo)))
                 next_si = scene.ray_intersect(ray, active)
-                ds = mi.DirectionSample3f(scene, next_si, si)
+                ds = self.emitters.towards(scene, next_si, si)
                 pdf_emitter = scene.pdf_emitter_direction(si, ds, active) / probability
                 # Emitters are left to emitter sampling, whose weights ignore points on gratings.
                 on_target, _ = self.gratings.classify(next_si, to_gratings & next_si.is_valid())
@@ -353,8 +355,12 @@ class SplatBuffer:
 
 
 def unpacked(splats: NDArray[np.float32]) -> tuple[mi.Point2f, mi.Spectrum, mi.Spectrum]:
-    """Return positions, wavelengths and values of contributions, see `LightPaths.splats`."""
-    x, y, *rest = (mi.Float(np.ascontiguousarray(column)) for column in splats.T)
+    """Return positions, wavelengths and values of contributions, see `LightPaths.splats`.
+
+    Of one or none zeros follow: kernels of arrays of one number, or without them, are others.
+    """
+    splats = np.pad(splats, ((0, max(2 - len(splats), 0)), (0, 0)))
+    x, y, *rest = (on_device(column) for column in splats.T)
     half = len(rest) // 2
     return mi.Point2f(x, y), mi.Spectrum(rest[:half]), mi.Spectrum(rest[half:])
 
@@ -406,9 +412,9 @@ class LightPaths:
 
     def _number_per_sample(self) -> float:
         """Return r."""
-        splats = [*self.splats(_PILOT_SEED, _PILOT_PATHS), np.zeros((1, 2 + 2 * dr.size_v(mi.Spectrum)), np.float32)]
+        splats = np.concatenate(list(self.splats(_PILOT_SEED, _PILOT_PATHS)))
         # Of a path for each sample.
-        values = np.concatenate(splats)[:, -dr.size_v(mi.Spectrum) :].mean(axis=1) * (_PILOT_PATHS / self.pixels)
+        values = splats[:, -dr.size_v(mi.Spectrum) :].mean(axis=1) * (_PILOT_PATHS / self.pixels)
         radiance = float(np.nanmean(self._direct_light())) + values.sum() / _PILOT_PATHS
         variance = np.square(values / (radiance or 1)).sum() / _PILOT_PATHS
         exponent = 0.5 * math.log2(variance) if variance > 0 else -math.inf
@@ -444,8 +450,7 @@ class LightPaths:
                     break
                 # Repeated with the same random numbers and a larger buffer, which later launches have at once.
                 self._capacity = 1.1 * buffer.count() / launched
-            if buffer.count() > 0:
-                yield buffer.content()
+            yield buffer.content()
 
     @dr.syntax
     def _trace(self, seed: mi.UInt32 | int, first: int, count: int, scale: float, buffer: SplatBuffer) -> None:

@@ -17,7 +17,7 @@ import mitsuba as mi
 import numpy as np
 from numpy.typing import NDArray
 
-from ..bsdf.device_tables import integer_part, larger, limited, opaque, smaller
+from ..bsdf.device_tables import integer_part, larger, limited, on_device, opaque, smaller
 
 MAX_OUTLINES = 12
 MARGIN = 1.01  # of outlines, against rounding at their edges
@@ -104,7 +104,8 @@ def _radiance(scene: mi.Scene, lamps: list[mi.Shape]) -> NDArray[np.float64]:
     numbers = [next(k for k, emitter in enumerate(emitters) if emitter is shape.emitter()) for shape in lamps]
     side = max(4, int(np.sqrt(_POINTS / len(lamps))))
     index = dr.arange(mi.UInt32, len(lamps) * side**2)
-    emitter = dr.gather(mi.EmitterPtr, scene.emitters_dr(), dr.gather(mi.UInt32, mi.UInt32(numbers), index // side**2))
+    number = dr.gather(mi.UInt32, on_device(numbers, mi.UInt32), index // side**2)
+    emitter = dr.gather(mi.EmitterPtr, scene.emitters_dr(), number)
     si = dr.zeros(mi.SurfaceInteraction3f, dr.width(index))
     si.shape, si.wi, si.wavelengths = emitter.get_shape(), mi.Vector3f(0, 0, 1), _spectrum()
     cell = index % side**2
@@ -189,7 +190,7 @@ def _environment_map(environment: mi.Emitter) -> mi.Float:
     cells = _folded_out(np.array(maxima).reshape(MAP_SIDE, MAP_SIDE))
     around = [cells[j : j + MAP_SIDE, i : i + MAP_SIDE] for j in range(3) for i in range(3)]
     result = np.max(around, axis=0).ravel()
-    return mi.Float(result) if np.ptp(result) > 1e-6 * result.max() else opaque(result.max())
+    return on_device(result) if np.ptp(result) > 1e-6 * result.max() else opaque(result.max())
 
 
 def _folded_out(cells: NDArray[np.float32]) -> NDArray[np.float32]:

@@ -18,6 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import fft
 
+from ..bsdf.device_tables import on_device
 from ..errors import RequestError, pip_install
 from ..optics.color import SRGB_TO_XYZ
 from .spectral_image import split_rows
@@ -112,7 +113,7 @@ def _response(kernel: mi.ReconstructionFilter, size: int) -> NDArray[np.float64]
     """Return √R at the frequencies of a discrete cosine transform of `size` numbers, one at f = 0; (size,)."""
     shifts = np.arange(int(np.ceil(2 * kernel.radius())) + 1)
     x = np.arange(-kernel.radius(), kernel.radius(), 1 / _STEPS_PER_PIXEL) + 0.5 / _STEPS_PER_PIXEL
-    h = np.array(kernel.eval(mi.Float(x)))
+    h = np.array(kernel.eval(on_device(x)))
     autocorrelation = np.array([h @ np.interp(x + shift, x, h, 0, 0) for shift in shifts])
     autocorrelation[1:] *= 2
     power = np.cos(np.pi * np.arange(size)[:, None] / size * shifts) @ autocorrelation

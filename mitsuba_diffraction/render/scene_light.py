@@ -11,6 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..bsdf.base import is_grating
+from ..bsdf.device_tables import on_device
 from ..bsdf.light import recorded_wavelengths
 
 _log = logging.getLogger(__name__)
@@ -49,7 +50,7 @@ def draw_wavelengths_of_lights(scene: mi.Scene) -> None:
             density = response + lines / (3 * max(1, lines.sum()))
             # Integers, so that Mitsuba's cumulative sums of them are exact in single precision.
             density = np.ceil(density * (2**23 / density.sum()))
-            distribution["values"] = type(distribution["values"])(density.astype(np.float32))
+            distribution["values"] = on_device(density)
             distribution.update()
 
 
@@ -62,7 +63,7 @@ def _emission(emitter: mi.Emitter, grid: NDArray[np.float64]) -> NDArray[np.floa
     si = dr.zeros(mi.SurfaceInteraction3f)
     si.wi = mi.Vector3f(0, 0, -1)
     numbers = (np.arange(_DRAWS_PER_LIGHT, dtype=np.float32) + 0.5) / _DRAWS_PER_LIGHT
-    wavelengths, weights = emitter.sample_wavelengths(si, mi.Float(numbers))
+    wavelengths, weights = emitter.sample_wavelengths(si, on_device(numbers))
     wavelengths, weights = (x.ravel() for x in np.broadcast_arrays(wavelengths, mi.unpolarized_spectrum(weights)))
     edges = np.append(grid, 2 * grid[-1] - grid[-2]) - (grid[1] - grid[0]) / 2
     return np.histogram(wavelengths, edges, weights=weights)[0]

@@ -23,6 +23,7 @@ import mitsuba as mi
 import numpy as np
 from numpy.typing import NDArray
 
+from ..bsdf.device_tables import on_device
 from ..bsdf.light import recorded_wavelengths
 from ..errors import RequestError, root_cause
 from ..integrator.paths import LightPaths, random_numbers, unpacked
@@ -226,7 +227,6 @@ class LightOfBands:
     def __init__(self, bands: tuple[Rows, ...]) -> None:
         self.bands = bands
         self._traced: tuple[int, int] | None = None
-        self._columns = 0
         self._files: list[Any] = []
         self._prepared: tuple[mi.Integrator, mi.SamplingIntegrator, LightPaths | None] | None = None
 
@@ -244,7 +244,6 @@ class LightOfBands:
             self.__del__()
             self._files = [tempfile.SpooledTemporaryFile(_SPOOLED_BYTES) for _ in self.bands]  # noqa: SIM115
             for traced in light.splats(seed, light.count(spp)):
-                self._columns = traced.shape[1]
                 for (first, end), file in zip(self.bands, self._files, strict=True):
                     row = traced[:, 1]
                     # Points on the lower edge of the film count as part of its last row.
@@ -253,7 +252,7 @@ class LightOfBands:
             self._traced = spp, seed
         file = self._files[self.bands.index(rows)]
         file.seek(0)
-        return np.frombuffer(file.read(), np.float32).reshape(-1, self._columns or 1)
+        return np.frombuffer(file.read(), np.float32).reshape(-1, 2 + 2 * dr.size_v(mi.Spectrum))
 
     def __del__(self) -> None:
         for file in self._files:
@@ -350,13 +349,11 @@ def _sums_of_light(
     spp: int,
     size: tuple[int, int],
     margins: tuple[int, int, int],
-) -> mi.Float | None:
-    """Return the sums of the contributions of paths from the light (see `collect`); None if there are none.
+) -> mi.Float:
+    """Return the sums of the contributions of paths from the light (see `collect`).
 
     Contributions are sorted by pixel, and within a pixel by the order of tracing.
     """
-    if not len(splats):
-        return None
     rows, columns = size
     _, above, below = margins
     row = np.clip(np.floor(splats[:, 1] - np.float32(first)).astype(np.int64) + above, 0, rows + above + below - 1)
@@ -364,7 +361,7 @@ def _sums_of_light(
     position, wavelengths, value = unpacked(splats[np.argsort(pixel, kind="stable")])
     position.y -= dr.opaque(mi.Float, first)
     counts = np.bincount(pixel, minlength=(rows + above + below) * columns)
-    starts = mi.UInt32(np.concatenate([[0], counts.cumsum()]))
+    starts = on_device(np.concatenate([[0], counts.cumsum()]), mi.UInt32)
     channel, value = _on_channels(film, wavelengths, value * dr.opaque(mi.Float, spp))
     dr.eval(position, channel, value)
 

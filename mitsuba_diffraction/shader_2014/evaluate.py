@@ -8,6 +8,7 @@ import mitsuba as mi
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from ..bsdf.device_tables import on_device
 from ..bsdf.testing import array, vectors
 from ..errors import RequestError
 from ..surface.heightfield import HeightField
@@ -102,7 +103,7 @@ def relative_radiance(
     wi, wo = (np.broadcast_to(omega, (*wavelengths.shape, 3)) if np.ndim(omega) == 1 else omega for omega in (wi, wo))
     wi, wo, shape = _directions(wi, wo)
     wavelengths = np.broadcast_to(wavelengths, shape).ravel()
-    return np.array(shader.relative_radiance(wi, wo, mi.Float(wavelengths))).reshape(shape)
+    return np.array(shader.relative_radiance(wi, wo, on_device(wavelengths))).reshape(shape)
 
 
 def _directions(wi: ArrayLike, wo: ArrayLike) -> tuple[mi.Vector3f, mi.Vector3f, tuple[int, ...]]:

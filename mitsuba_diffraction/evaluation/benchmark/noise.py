@@ -17,6 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ...bsdf.base import gratings_in
+from ...bsdf.device_tables import on_device
 from ...errors import RequestError
 from ...files.writing import examples_folder
 from ...optics.color import spectrum_to_linear_sRGB
@@ -137,7 +138,7 @@ def shows_gratings(scene: mi.Scene, across: int = 1) -> NDArray[np.bool_]:
     sensor = scene.sensors()[0]
     columns, rows = sensor.film().crop_size()
     y, x = np.mgrid[: across * rows, : across * columns].reshape(2, -1) + 0.5
-    position = mi.Point2f((x / (across * columns)).astype(np.float32), (y / (across * rows)).astype(np.float32))
+    position = mi.Point2f(on_device(x / (across * columns)), on_device(y / (across * rows)))
     si = scene.ray_intersect(mi.Ray3f(sensor.sample_ray(0.0, 0.5, position, mi.Point2f(0.5))[0]))
     shapes = [shape for shape in scene.shapes() if gratings_in(shape.bsdf())]
     hit = functools.reduce(operator.or_, (si.shape == mi.ShapePtr(shape) for shape in shapes), mi.Bool(False))

@@ -12,6 +12,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from ...bsdf import testing
+from ...bsdf.device_tables import on_device
 from ...progress import Progress, silent
 from ...settings import VISIBLE
 from .cases import Case
@@ -119,7 +120,7 @@ def _against_cosine(bsdf: mi.BSDF, angle: float, count: int, repetitions: int) -
     """Return variance times seconds of cosine sampling, relative to the BSDF's own sampling, under a uniform sky."""
     random = np.random.default_rng(1)
     si = testing.interaction(np.broadcast_to(testing.direction(angle, 30.0), (count, 3)), _wavelengths(0.3))
-    sample1, sample2 = mi.Float(random.random(count)), mi.Point2f(random.random((2, count)))
+    sample1, sample2 = on_device(random.random(count)), mi.Point2f(*map(on_device, random.random((2, count))))
     dr.eval(si, sample1, sample2)
 
     def own() -> mi.Float:

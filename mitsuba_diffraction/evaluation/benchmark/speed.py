@@ -15,6 +15,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
+from ...bsdf.device_tables import on_device
 from ...bsdf.testing import interaction, vectors
 from ...settings import VISIBLE
 
@@ -29,8 +30,8 @@ class Rays:
         self.count = count
         wi, wo = (_directions(random, count) for _ in range(2))
         self.si, self.wo = interaction(wi, random.uniform(*VISIBLE, (4, count)).T), vectors(wo)
-        self.sample1 = mi.Float(random.random(count))
-        self.sample2 = mi.Point2f(mi.Float(random.random(count)), mi.Float(random.random(count)))
+        self.sample1 = on_device(random.random(count))
+        self.sample2 = mi.Point2f(*map(on_device, random.random((2, count))))
         dr.eval(self.si, self.wo, self.sample1, self.sample2)
 
     def evaluate(self, bsdf: mi.BSDF) -> None:

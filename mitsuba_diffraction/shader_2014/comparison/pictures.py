@@ -15,6 +15,7 @@ import mitsuba as mi
 import numpy as np
 from numpy.typing import NDArray
 
+from ...bsdf.device_tables import on_device
 from ...errors import RequestError
 from ...evaluation.benchmark.noise import shows_gratings
 from ...optics.color import spectrum_to_XYZ
@@ -412,7 +413,7 @@ class Pictures:
     def _averaged(self, points: list[NDArray[np.float32]]) -> NDArray[np.float64]:
         """Return the means over the pixels, (height, width, 3), of `_shade`, with equally many points per pixel."""
         rows, columns = self.surface.shape
-        x, y, *rgb = (mi.Float(column) for column in np.concatenate(points, axis=1))
+        x, y, *rgb = (on_device(column) for column in np.concatenate(points, axis=1))
         channels = [dr.opaque(mi.Float, channel, shape=len(x)) for channel in range(3)]
         rfilter = self.scene.sensors()[0].film().rfilter()
         count = dr.opaque(mi.UInt32, len(x) // (rows * columns))
