@@ -76,6 +76,11 @@ def parse_numbers(option: str, text: str) -> NDArray[np.float64]:
         raise RequestError(f"{option}: got {text!r}, wanted a number, numbers as 0,30,60, or first:last:step") from None
 
 
+def incidence_of(option: str, text: str) -> NDArray[np.float64] | str:
+    """Return angles of incidence as `angles_of`, or the text of a Littrow mounting, which is checked later."""
+    return text if text.startswith("littrow") else angles_of(option, text)
+
+
 def angles_of(option: str, text: str) -> NDArray[np.float64]:
     """Return angles from the normal in degrees, (n,), given as in `parse_numbers`."""
     found = parse_numbers(option, text)

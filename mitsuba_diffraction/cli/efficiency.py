@@ -22,8 +22,8 @@ from .arguments import (
     KEYS_OF_RECIPES,
     SURFACE,
     Overwrite,
-    angles_of,
     check_suffix,
+    incidence_of,
     named_as_options,
     parse_numbers,
 )
@@ -31,7 +31,7 @@ from .arguments import (
 _OF_LIGHT = ("theory", "transmission", "material", "int_ior", "ext_ior")  # besides the surface
 
 
-@named_as_options({"wavelengths": "--wavelength"})
+@named_as_options({"wavelengths": "--wavelength", "angles": "--angle", "azimuth": "--azimuth"})
 def efficiency(
     surface: Annotated[
         str,
@@ -43,7 +43,11 @@ def efficiency(
         ),
     ],
     angle: Annotated[
-        str, typer.Option(help="angle of incidence, degrees: a number, several (0,30), or first:last:step")
+        str,
+        typer.Option(
+            help="angle of incidence, degrees: a number, several (0,30), or first:last:step; or littrow, where order 1 "
+            "returns to the source; littrow:m, order m"
+        ),
     ] = "0",
     wavelength: Annotated[str, typer.Option(help="nm: a number, several, or first:last:step")] = "400:700:50",
     azimuth: Annotated[
@@ -54,7 +58,7 @@ def efficiency(
     overwrite: Overwrite = False,
 ) -> None:
     """Compute how much light goes into each order of a grating, or each spectral peak of an irregular surface."""
-    angles, wavelengths = angles_of("--angle", angle), parse_numbers("--wavelength", wavelength)
+    angles, wavelengths = incidence_of("--angle", angle), parse_numbers("--wavelength", wavelength)
     requested = RequestedSurface.of(surface, aside=_OF_LIGHT)
     name, theory = requested.title, requested.theory
     settings = ScalarSettings() if requested.is_spectrum else requested.stated.settings

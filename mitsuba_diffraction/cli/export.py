@@ -22,13 +22,13 @@ from .arguments import (
     KEYS_OF_RECIPES,
     SURFACE,
     Overwrite,
-    angles_of,
     check_suffix,
+    incidence_of,
     named_as_options,
     parse_numbers,
 )
 
-_OPTIONS = {"wavelengths": "--wavelength", "azimuths": "--azimuth"}
+_OPTIONS = {"wavelengths": "--wavelength", "angles": "--angle", "azimuths": "--azimuth", "azimuth": "--azimuth"}
 _OF_MATERIAL = ("theory", "material", "int_ior")
 _INPUTS = {"orientation": "Orientation", "height_scale": "HeightScale", "base": "BaseColor"}  # of the shader
 _IN_SCENES = ("coat_ior", "thin_film_ior", "thin_film_thickness", "transmission", "ext_ior", "lateral_scale", *_INPUTS)
@@ -61,7 +61,10 @@ def export(
         typer.Option(help="nm: a number, several, or first:last:step; default: 400:700:10, .json 450:650:50"),
     ] = None,
     angle: Annotated[
-        str | None, typer.Option(help="polar angle of the light, degrees; default: 0:80:5, .json 0:80:10")
+        str | None,
+        typer.Option(
+            help="polar angle of the light, degrees; default: 0:80:5, .json 0:80:10; .csv: littrow, littrow:m"
+        ),
     ] = None,
     azimuth: Annotated[
         str | None, typer.Option(help="azimuth towards which the light travels, degrees; default: 0, .json 0:360:30")
@@ -119,7 +122,7 @@ def _write_shader(requested: RequestedSurface, output: Path) -> None:
 def _write_orders(requested: RequestedSurface, output: Path, given: dict[str, str]) -> None:
     suffix = output.suffix.lower()
     ranges = _RANGES[suffix] | given
-    wavelengths, angles = parse_numbers("--wavelength", ranges["wavelength"]), angles_of("--angle", ranges["angle"])
+    wavelengths, angles = parse_numbers("--wavelength", ranges["wavelength"]), incidence_of("--angle", ranges["angle"])
     azimuths = parse_numbers("--azimuth", ranges["azimuth"])
     grating = ExportedGrating.of_surface(requested, float(wavelengths.min()) * 1e-3)
     requested.say_extent()

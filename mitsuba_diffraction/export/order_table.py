@@ -11,6 +11,7 @@ from numpy.typing import ArrayLike
 
 from ..files.outputs import MARK
 from ..files.writing import whole_file
+from ..inspection.efficiency import at_wavelengths, checked_angles
 from ..inspection.order_solver import IncidentLight
 from ..progress import Progress, silent
 from .exported_grating import DiffractedSide, ExportedGrating, checked_ranges
@@ -38,7 +39,7 @@ def write_order_table(
     grating: ExportedGrating,
     path: str | os.PathLike[str],
     wavelengths: ArrayLike,
-    angles: ArrayLike,
+    angles: ArrayLike | str,
     azimuths: ArrayLike = 0.0,
     progress: Progress = silent,
 ) -> int:
@@ -50,29 +51,31 @@ def write_order_table(
         grating: the surface.
         path: of the file.
         wavelengths: nm, in vacuum, (w,).
-        angles: polar angles of the light, degrees, (a,).
+        angles: polar angles of the light, degrees, (a,), or a Littrow mounting, as in `efficiencies`.
         azimuths: of the light, degrees, (b,).
         progress: called with (steps done, steps in all).
 
     Raises:
         ValueError: if an argument is out of range, or as `rigorous.efficiencies`.
     """
-    wavelengths, angles, azimuths = checked_ranges(wavelengths, angles, azimuths)
+    wavelengths, _, azimuths = checked_ranges(wavelengths, 0.0, azimuths)
+    incidence = at_wavelengths(checked_angles(angles, wavelengths, grating.period[0], azimuths), len(wavelengths))
     rigorous = grating.theory == "rigorous"
     x, y = grating.period
     period = f"period {x:.9g} um along x; grooves along y"
     if grating.height_field.shape[0] > 1:
         period = f"periods {x:.9g} and {y:.9g} um along x and y"
     header = (_HEADER + _AMPLITUDES * rigorous).format(mark=MARK, what=grating.description, period=period)
-    count, shape = 0, (len(wavelengths), len(azimuths), len(angles))
+    count, shape = 0, (len(wavelengths), len(azimuths), len(incidence))
     with whole_file(path) as temporary, open(temporary, "w", newline="", encoding="utf-8") as stream:
         stream.writelines(f"# {line}\n" for line in header.splitlines())
         rows = csv.writer(stream, lineterminator="\n")
         rows.writerow([*_COLUMNS, *(_JONES if rigorous else [])])
         for step, (w, b, a) in enumerate(np.ndindex(shape), 1):
             wavelength = float(wavelengths[w]) * 1e-3
-            light = IncidentLight(float(angles[a]), float(azimuths[b]), wavelength, grating.below.at(wavelength))
-            of_light = [f"{number:.9g}" for number in (wavelengths[w], angles[a], azimuths[b])]
+            angle = float(incidence[a, w])
+            light = IncidentLight(angle, float(azimuths[b]), wavelength, grating.below.at(wavelength))
+            of_light = [f"{number:.9g}" for number in (wavelengths[w], angle, azimuths[b])]
             for side in grating.diffracted(light):
                 for row in _rows(side):
                     rows.writerow(of_light + row)

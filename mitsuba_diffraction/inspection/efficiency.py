@@ -40,7 +40,7 @@ class OrderEfficiencies:
             not propagate.
         orders: m, (n,), ascending; for a tile that varies along x and y (m_x, m_y), (n, 2); or names of peaks
             (`PeakEfficiencies`).
-        angles: of incidence, degrees, (a,).
+        angles: of incidence, degrees, (a,); in Littrow mounting one for each wavelength, (1, w).
         wavelengths: nm, in vacuum, (w,).
         source: description of the surface, material and theory.
     """
@@ -56,10 +56,15 @@ class OrderEfficiencies:
         """Return the names of the axes of `values` and the coordinates along them."""
         return {
             "order": [tuple(m) if isinstance(m, list) else m for m in self.orders.tolist()],
-            "angle": self.angles.tolist(),
+            "angle": ["Littrow"] if self.angles.ndim == 2 else self.angles.tolist(),
             "wavelength": self.wavelengths.tolist(),
             "polarisation": list(POLARISATIONS),
         }
+
+    @property
+    def incidence(self) -> Real:
+        """Return the angle of incidence at each angle and wavelength, degrees, (a, w)."""
+        return at_wavelengths(self.angles, len(self.wavelengths))
 
     @property
     def unpolarised(self) -> Real:
@@ -84,9 +89,9 @@ class OrderEfficiencies:
         names = [_name(self.axes["order"][index]) for index in kept]
         width = max(8, *(len(name) + 2 for name in names))
         rows = [
-            [f"{angle:g}°", f"{wavelength:g} nm", *(f"{100 * e:.3f}" for e in (*of_all[kept], of_all.sum()))]
-            for angle, of_angle in zip(self.angles, np.moveaxis(self.unpolarised, 0, -1), strict=True)
-            for wavelength, of_all in zip(self.wavelengths, of_angle, strict=True)
+            [f"{angle:.5g}°", f"{wavelength:g} nm", *(f"{100 * e:.3f}" for e in (*of_all[kept], of_all.sum()))]
+            for of_angles, of_angle in zip(self.incidence, np.moveaxis(self.unpolarised, 0, -1), strict=True)
+            for angle, wavelength, of_all in zip(of_angles, self.wavelengths, of_angle, strict=True)
         ]
         lines = [
             "".join(f"{cell:>{width}}" for cell in row) for row in [["angle", "λ", *names, "sum"], *rows[:_MAX_ROWS]]
@@ -115,7 +120,7 @@ class OrderEfficiencies:
             rows.writerow([*names, "angle_deg", "wavelength_nm", *POLARISATIONS, "unpolarised"])
             for order, a, w in np.ndindex(self.values.shape[:3]):
                 pair = self.values[order, a, w]
-                numbers = self.angles[a], self.wavelengths[w], *pair, pair.mean()
+                numbers = self.incidence[a, w], self.wavelengths[w], *pair, pair.mean()
                 rows.writerow([*np.atleast_1d(self.orders[order]), *(f"{number:.9g}" for number in numbers)])
             stream.write(f"# {MARK}\n")
 
@@ -136,11 +141,14 @@ class OrderEfficiencies:
         return figure
 
     def _plot_lines(self, figure: Figure) -> None:
-        over_wavelengths = len(self.angles) <= len(self.wavelengths)
-        x, along, unit = (self.wavelengths, 1, "° incidence") if over_wavelengths else (self.angles, 2, " nm")
+        littrow = self.angles.ndim == 2
+        over_wavelengths = littrow or len(self.angles) <= len(self.wavelengths)
+        x, along = (self.wavelengths, 1) if over_wavelengths else (self.angles, 2)
         panels = figure.subplots(1, self.values.shape[along], sharey=True, squeeze=False)[0]
-        fixed = self.angles if over_wavelengths else self.wavelengths
-        for axes, value, values in zip(panels, fixed, np.moveaxis(self.values, along, 0), strict=True):
+        titles = [f"{angle:g}° incidence" for angle in self.angles] if not littrow else ["Littrow mounting"]
+        if not over_wavelengths:
+            titles = [f"{wavelength:g} nm" for wavelength in self.wavelengths]
+        for axes, title, values in zip(panels, titles, np.moveaxis(self.values, along, 0), strict=True):
             for number, index in enumerate(self._strongest(_MAX_LINES)):
                 own = {"color": f"C{number}", "marker": "." if len(x) < 30 else None}
                 axes.plot(x, values[index].mean(axis=-1), **own, label=f"order {_name(self.axes['order'][index])}")
@@ -148,7 +156,7 @@ class OrderEfficiencies:
                 axes.plot(x, values[index, :, 1], ":", color=own["color"], lw=1)
             axes.plot(x, values.mean(axis=-1).sum(axis=0), color="0.6", label="all orders")
             axes.set_xlabel(_WAVELENGTH if over_wavelengths else _ANGLE)
-            axes.set_title(f"{value:g}{unit}", fontsize=9)
+            axes.set_title(title, fontsize=9)
         panels[0].set(ylabel="efficiency", ylim=(0, None))
         for style, name in (("k-", "unpolarised"), ("k--", "s-polarised"), ("k:", "p-polarised")):
             axes.plot([], [], style, lw=1, label=name)
@@ -181,7 +189,7 @@ def _name(order: int | str | tuple[int, int]) -> str:
 
 def efficiencies(
     height_field: HeightField,
-    angles: ArrayLike,
+    angles: ArrayLike | str,
     wavelengths: ArrayLike,
     *,
     theory: str = "scalar",
@@ -204,7 +212,9 @@ def efficiencies(
 
     Args:
         height_field: one period of a periodic surface; rigorous theory needs a profile, h(x).
-        angles: of incidence, degrees, one or (a,), above −90 and below 90.
+        angles: of incidence, degrees, one or (a,), above −90 and below 90; or "littrow", the mounting in which order 1
+            returns to the source, "littrow:m" of order m: sin θ_i = m λ/(2T). Transmitted light of that order is then
+            deviated least by a sheet (Bragg's angle).
         wavelengths: nm, in vacuum, one or (w,).
         theory: "scalar" or "rigorous".
         material: a conductor by Mitsuba's name, "Al", or a file; or "none", the perfect mirror R = 1, in scalar theory.
@@ -231,7 +241,7 @@ def efficiencies(
 def order_efficiencies(
     height_field: HeightField,
     below: MediumBelow,
-    angles: ArrayLike,
+    angles: ArrayLike | str,
     wavelengths: ArrayLike,
     azimuth: float,
     theory: str,
@@ -239,8 +249,9 @@ def order_efficiencies(
     progress: Progress = silent,
 ) -> OrderEfficiencies:
     """Compute `efficiencies` of a grating above a medium; the same arguments, errors and warnings."""
-    angles = checked_numbers("angles", angles, "degrees above −90 and below 90", -90.0, 90.0)
     wavelengths = checked_numbers("wavelengths", wavelengths, "nm from 10 to 100000 (100 µm)", 9.999, 100_000.001)
+    angles = checked_angles(angles, wavelengths, height_field.tile_size[0], azimuth)
+    incidence = at_wavelengths(angles, len(wavelengths))
     if theory not in THEORIES:
         raise RequestError(f"theory: got {theory!r}, wanted one of {', '.join(THEORIES)}")
     if not is_number(azimuth) or not np.isfinite(azimuth):
@@ -257,13 +268,13 @@ def order_efficiencies(
     solver = order_solver(theory, height_field, 1e-3 * float(np.min(2 * wavelengths / (1 + n))))
     solve = {"none": solver.reflected, "interface": solver.transmitted, "sheet": solver.through_sheet}[transmission]
     found: dict[tuple[int, ...], Real] = {}
-    for step, (a, w) in enumerate(np.ndindex(len(angles), len(wavelengths)), 1):
+    for step, (a, w) in enumerate(np.ndindex(incidence.shape), 1):
         wavelength = float(wavelengths[w]) * 1e-3
-        orders = solve(IncidentLight(float(angles[a]), azimuth, wavelength, below.at(wavelength)))
+        orders = solve(IncidentLight(float(incidence[a, w]), azimuth, wavelength, below.at(wavelength)))
         for m, *pair in zip(orders.m, orders.s, orders.p, strict=True):
-            of_order = found.setdefault(tuple(np.atleast_1d(m).tolist()), np.zeros((len(angles), len(wavelengths), 2)))
+            of_order = found.setdefault(tuple(np.atleast_1d(m).tolist()), np.zeros((*incidence.shape, 2)))
             of_order[a, w] = pair
-        progress(step, len(angles) * len(wavelengths))
+        progress(step, incidence.size)
     all_orders = sorted(found)
     return OrderEfficiencies(
         np.stack([found[m] for m in all_orders]),
@@ -283,6 +294,43 @@ def description(
         transmission
     ]
     return f"{source}; {below}, {theory} theory{transmitted}{plane}"
+
+
+def checked_angles(angles: ArrayLike | str, wavelengths: Real, period: float, azimuth: float | Real) -> Real:
+    """Return angles of incidence, degrees, (a,), or those of a Littrow mounting, one for each wavelength, (1, w).
+
+    Args:
+        angles: as in `efficiencies`.
+        wavelengths: nm, (w,).
+        period: along x, µm.
+        azimuth: of the plane of incidence; 0 in Littrow mounting.
+
+    Raises:
+        ValueError: if the angles are out of range, or there is no such mounting.
+    """
+    if not isinstance(angles, str):
+        return checked_numbers("angles", angles, "degrees above −90 and below 90", -90.0, 90.0)
+    name, _, text = str(angles).partition(":")
+    try:
+        order = int(text or 1)
+    except ValueError:
+        order = 0
+    if name != "littrow" or order == 0:
+        raise RequestError(f"angles: got {angles!r}, wanted degrees, 'littrow' (order 1), or 'littrow:m' of an order m")
+    if np.any(azimuth):
+        raise RequestError(f"azimuth: got {azimuth} in Littrow mounting, wanted 0")
+    sine = order * wavelengths / (2e3 * period)
+    if (outside := np.abs(sine) >= 1).any():
+        raise RequestError(
+            f"wavelengths: got {wavelengths[outside][0]:g} nm, wanted below {2e3 * period / abs(order):g} nm: order "
+            f"{order} of a period of {period:g} µm has no Littrow mounting there"
+        )
+    return np.rad2deg(np.arcsin(sine))[None, :]
+
+
+def at_wavelengths(angles: Real, count: int) -> Real:
+    """Return the angle of incidence at each angle and wavelength, (a, w), of what `checked_angles` returns."""
+    return np.broadcast_to(angles if angles.ndim == 2 else angles[:, None], (len(angles), count))
 
 
 def checked_numbers(name: str, values: ArrayLike, wanted: str, low: float, high: float) -> Real:

@@ -152,6 +152,15 @@ def test_scalar_theory_agrees_with_efficiencies_and_conserves_energy(tmp_path):
     assert sum(row["efficiency"] for row in chosen(mirror, polarisation="mean")) <= 1
 
 
+def test_the_table_of_a_littrow_mounting_has_the_angle_of_each_wavelength(tmp_path):
+    rows = table(tmp_path / "t.csv", md.gratings.ruled(600), [450, 600], "littrow", theory="scalar", material="Al")
+    for row in chosen(rows, m=1, polarisation="mean"):
+        # The order travels back: (u, v, w) is minus the direction of the light.
+        theta = np.deg2rad(row["theta_deg"])
+        np.testing.assert_allclose([row["u"], row["v"], row["w"]], [-np.sin(theta), 0, np.cos(theta)], atol=1e-9)
+    assert {row["wavelength_nm"] for row in chosen(rows, m=1)} == {450, 600}
+
+
 def test_the_command_writes_a_table(command, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     words = "blazed,period=1.2,depth=0.2,theory=rigorous,material=Al", "--wavelength", "500,600", "--angle", "0,30"

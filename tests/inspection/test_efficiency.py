@@ -150,6 +150,31 @@ def test_a_blaze_in_littrow_mount_diffracts_light_back_to_its_source(theory):
     assert fraction[list(found.orders).index(-1), 1] < 0.02
 
 
+@pytest.mark.parametrize(("mounting", "m"), [("littrow", 1), ("littrow:2", 2), ("littrow:-1", -1)])
+def test_in_littrow_mounting_the_order_returns_to_the_source(mounting, m, tmp_path):
+    grating = md.gratings.ruled(600, blaze_wavelength=500)
+    found = md.efficiencies(grating, mounting, WAVELENGTHS, material="Al")
+    assert found.values.shape == (len(found.orders), 1, 2, 2)
+    for w, (wavelength, angle) in enumerate(zip(WAVELENGTHS, found.incidence[0], strict=True)):
+        # The grating equation with θ_m = θ_i.
+        assert 2 * np.sin(np.deg2rad(angle)) == pytest.approx(m * wavelength * 1e-3 * 0.6)
+        alone = md.efficiencies(grating, angle, wavelength, material="Al")
+        np.testing.assert_allclose(found.order(m)[0, w], alone.order(m)[0, 0], rtol=1e-12)
+    found.save_csv(tmp_path / "table.csv")
+    rows = list(csv.DictReader((tmp_path / "table.csv").read_text().splitlines()[:-1]))
+    assert {row["angle_deg"] for row in rows} == {f"{angle:.9g}" for angle in found.incidence[0]}
+    assert found.plot().axes[0].get_title() == "Littrow mounting"
+
+
+def test_in_littrow_mounting_a_sheet_deviates_the_order_least():
+    grating, wavelength = md.gratings.transmission_300(), 550.0
+    found = md.efficiencies(grating, "littrow", wavelength, transmission="sheet")
+    angles = found.incidence[0, 0] + np.linspace(-5, 5, 11)
+    # θ_m towards −x, where light that is not deviated leaves at −θ_i.
+    leaving = np.rad2deg(np.arcsin(wavelength * 1e-3 * 0.3 - np.sin(np.deg2rad(angles))))
+    assert np.argmin(angles + leaving) == 5
+
+
 def test_axes_describe_the_values():
     found = md.efficiencies(md.gratings.blazed(1.0, 0.1), ANGLES, WAVELENGTHS)
     assert list(found.axes) == ["order", "angle", "wavelength", "polarisation"]
@@ -163,6 +188,10 @@ def test_axes_describe_the_values():
     ("arguments", "message"),
     [
         ({"angles": [0, 95]}, "angles: got 95, wanted degrees"),
+        ({"angles": "littrow:0"}, "angles: got 'littrow:0', wanted degrees, 'littrow' "),
+        ({"angles": "bragg"}, "angles: got 'bragg', wanted degrees, 'littrow' "),
+        ({"angles": "littrow", "azimuth": 30}, "azimuth: got 30 in Littrow mounting, wanted 0"),
+        ({"angles": "littrow:9"}, "wavelengths: got 400 nm, wanted below "),
         ({"angles": []}, "angles: got an array of shape"),
         ({"wavelengths": 0.5}, "wavelengths: got 0.5, wanted nm"),
         ({"wavelengths": "blue"}, "wavelengths: got 'blue', wanted nm"),
