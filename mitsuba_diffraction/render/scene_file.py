@@ -30,6 +30,7 @@ from .parser_state import children_of, resolved_file
 from .scene import instantiated, move_first_sensor, replace_path, unwrap_integrators
 from .scene_light import draw_wavelengths_of_lights
 from .scene_materials import Materials, check_materials, replace_materials, warn_of_unused_materials
+from .scene_numbers import read_numbers
 from .spectral_film import replace_films
 
 _PLUGINS = ("diffraction_grating", "diffraction_path", "diffraction_shader")
@@ -209,6 +210,7 @@ class SceneFile:
             replace_films(state, *self.size)
             unwrap_integrators(state)
             replace_path(state)
+            read_numbers(config, state)
             if self.motion is not None:
                 move_first_sensor(state, self.motion)
             scene = instantiated(config, state)
