@@ -9,6 +9,7 @@ from __future__ import annotations
 import functools
 import hashlib
 import os
+import warnings
 from dataclasses import dataclass, field
 from difflib import get_close_matches
 from importlib import metadata
@@ -28,7 +29,10 @@ _MAX_FAR = 1e5  # of n and k elsewhere: metals have a thousand in the far infrar
 _MAX_NOISE = 5e-3  # of k, by which measured curves fall below 0
 _MAX_SPREAD = 0.05  # of n or k, relative, in rows of one wavelength
 _ROWS = 20_000  # at most, of a formula
+_MIN_LIKENESS = 0.8  # of a wrong name to one that is proposed, from 0 to 1
 FILES = (".spd", ".csv", ".yml")
+_PAGE = "a file, such as a page of refractiveindex.info (.yml)"
+_FAR_INFRARED = 5e4  # nm, where tables begin that have, or seem to have, wavelengths of another unit
 NOMINAL_WAVELENGTH = float(np.sqrt(VISIBLE[0] * VISIBLE[1])) * 1e-3
 """µm, in the middle of visible light. Where one number stands for a medium with dispersion, it is n at this λ."""
 _OWN = Path(__file__).parents[1] / "data" / "ior"
@@ -86,6 +90,14 @@ DISPERSION: dict[str, tuple[int, tuple[float, ...], tuple[float, float], str]] =
 
 
 @dataclass(frozen=True)
+class Doubt:
+    """What is in doubt about an index, from `wavelengths[0]` to `wavelengths[1]`, nm."""
+
+    wavelengths: tuple[float, float]
+    text: str
+
+
+@dataclass(frozen=True)
 class KnownRange:
     """The wavelengths at which the index of a parameter is known.
 
@@ -94,31 +106,40 @@ class KnownRange:
         source: the name of the medium or of the file.
         wavelengths: (shortest, longest), nm.
         clear: the index, of a medium that is taken as transparent; else None.
+        doubts: about the index.
     """
 
     parameter: str
     source: str
     wavelengths: tuple[float, float]
     clear: RefractiveIndex | None = None
+    doubts: tuple[Doubt, ...] = ()
 
     def check(self, light: tuple[float, float]) -> None:
         """Check that the index is known for light of wavelengths (shortest, longest), nm.
 
         Raises:
             RequestError: if it is not, or the light is absorbed where the medium is taken as transparent.
+
+        Warns:
+            UserWarning: if the index is in doubt for this light.
         """
         (first, last), (shortest, longest) = light, self.wavelengths
         of_light = _nanometres(light)
+        unit = "; wavelengths of .csv and .yml are in µm" if shortest > _FAR_INFRARED else ""
         if first < shortest * (1 - 1e-6) or last > longest * (1 + 1e-6):
             raise RequestError(
                 f"{self.parameter}: got light of {of_light}, and a table of {_nanometres(self.wavelengths)} "
-                f"({self.source}); wanted light inside its range, or another index"
+                f"({self.source}); wanted light inside its range, or another index, from {_PAGE}{unit}"
             )
         if self.clear is not None and (k := self.clear.max_k(light)) > MAX_CLEAR_K:
             raise RequestError(
                 f"{self.parameter}: got light of {of_light}, and k up to {k:.3g} ({self.source}), wanted a transparent "
                 "medium; give it as material"
             )
+        for doubt in self.doubts:
+            if doubt.wavelengths[0] < last and doubt.wavelengths[1] > first:
+                warnings.warn(f"{self.parameter}: {self.source} has {doubt.text}", stacklevel=2)
 
 
 def _nanometres(wavelengths: tuple[float, float]) -> str:
@@ -134,11 +155,13 @@ class RefractiveIndex:
         name: as it was requested.
         wavelengths: µm, ascending, (J,); a single 0 of an index without dispersion.
         values: n + ik, (J,).
+        doubts: where they are not those of a file.
     """
 
     name: str
     wavelengths: NDArray[np.float64] = field(repr=False)
     values: NDArray[np.complex128] = field(repr=False)
+    doubts: tuple[Doubt, ...] = field(default=(), repr=False)
 
     @property
     def _key(self) -> tuple[str, bytes, bytes]:
@@ -192,7 +215,7 @@ class RefractiveIndex:
 
     def known(self, parameter: str, clear: bool = False) -> KnownRange:
         """Return where the index is known, for a parameter that names it; `clear`: taken as transparent there."""
-        return KnownRange(parameter, self.name, self.range, self if clear else None)
+        return KnownRange(parameter, self.name, self.range, self if clear else None, self.doubts)
 
     def __str__(self) -> str:
         return self.name
@@ -284,13 +307,20 @@ def _medium(name: str) -> RefractiveIndex | None:
 
 
 def _near(name: str, known: list[str]) -> list[str]:
-    """Return the names in `known` that may be meant: of the same element or beginning, or spelt similarly."""
+    """Return the names in `known` that are meant: of the same element or compound, or of a word spelt similarly."""
     lower = name.lower()
-    if lower in _SYMBOLS:
-        return [other for other in known if other.partition("_")[0] == _SYMBOLS[lower]]
-    same = [other for other in known if other.lower().startswith(lower)]
-    first = max((other for other in known if len(other) > 1 and lower.startswith(other.lower())), key=len, default=None)
-    return [first] if first else same[:3] or get_close_matches(name, known)
+    symbol = _stem(name)
+    if symbol not in map(_stem, known):
+        words = [word for word in _SYMBOLS if len(lower) > 2 and word.startswith(lower)]
+        words = words or get_close_matches(lower, _SYMBOLS, n=1, cutoff=_MIN_LIKENESS)
+        symbol = _SYMBOLS[words[0]].lower() if words else ""
+    same = [other for other in known if _stem(other) == symbol]
+    return same or get_close_matches(name, [other for other in known if len(other) > 4], n=1, cutoff=_MIN_LIKENESS)
+
+
+def _stem(name: str) -> str:
+    """Return the element or compound in the name of a conductor, as in Al_palik, in lower case."""
+    return name.lower().partition("_")[0]
 
 
 @functools.cache
@@ -307,7 +337,7 @@ def conductor(material: str) -> RefractiveIndex:
     paths = {path.name.removesuffix(".eta.spd"): path for path in tables}
     known = sorted(paths)
     if material not in known:
-        wanted = f"one of {', '.join(known) or 'none: no tables found'}"
+        wanted = f"one of {', '.join(known) or 'none: no tables found'}, or {_PAGE}"
         if near := _near(str(material), known):
             wanted = " or ".join(near)
         raise RequestError(f"material: got {material!r}, {'did you mean' if near else 'wanted'} {wanted}")
@@ -349,7 +379,9 @@ def _read(path: Path, *state: int) -> RefractiveIndex:
     try:
         of_n, of_k = {".spd": _read_spd, ".csv": _read_csv, ".yml": _read_yml}[path.suffix.lower()](path)
         of_n, of_k = _ascending(of_n, "n"), None if of_k is None else _ascending(of_k, "k")
-        _check_unit(of_n[0], path.suffix.lower())
+        if path.suffix.lower() == ".spd" and of_n[0, -1] < 0.02:
+            first, last = of_n[0, [0, -1]] * 1e3
+            raise RequestError(f"got wavelengths from {first:g} to {last:g} nm: a table in µm? .spd files have nm")
         wavelengths, n, k = _where_known(of_n, of_k)
         start, stop = _possible_rows(wavelengths, n, k)
     except RequestError as error:
@@ -357,8 +389,9 @@ def _read(path: Path, *state: int) -> RefractiveIndex:
     except (ValueError, KeyError, TypeError, IndexError, AttributeError) as error:
         text = str(error).splitlines()[0] if str(error) else type(error).__name__
         raise RequestError(f"{path}: not a table of refractive indices ({text})") from None
+    known = wavelengths[start:stop]
     index = n[start:stop] + 1j * np.maximum(k[start:stop], 0)
-    return RefractiveIndex(path.name, wavelengths[start:stop], index)
+    return RefractiveIndex(path.name, known, index, _doubts(known, of_k))
 
 
 def _ascending(table: _Table, what: str) -> _Table:
@@ -384,37 +417,38 @@ def _ascending(table: _Table, what: str) -> _Table:
     return np.stack([wavelengths, value])
 
 
-def _check_unit(wavelengths: _Table, suffix: str) -> None:
-    """Check the wavelengths of a table, µm.
-
-    Raises:
-        RequestError: if they are three powers of ten off, as those of visible light in the other unit.
-    """
-    first, last = wavelengths[[0, -1]]
-    unit, other = ("nm", "µm") if suffix == ".spd" else ("µm", "nm")
-    if first > 50 or last < 0.02:
-        scale = 1e3 if unit == "nm" else 1.0
-        raise RequestError(
-            f"got wavelengths from {first * scale:g} to {last * scale:g} {unit}: a table in {other}? "
-            f"{suffix} files have {unit}"
-        )
-
-
 def _where_known(of_n: _Table, of_k: _Table | None) -> tuple[_Table, _Table, _Table]:
-    """Return the wavelengths at which both n and k are known, with n and k; k = 0 without a table of it.
+    """Return the wavelengths at which n is known, and k is or may be taken as 0, with n and k.
+
+    k is 0 without a table of it, and beyond an end of its table at which it is that of clear glass.
 
     Raises:
         RequestError: if there are none.
     """
     if of_k is None:
         return of_n[0], of_n[1], np.zeros_like(of_n[1])
-    first, last = (choose(of_n[0, end], of_k[0, end]) for end, choose in ((0, max), (-1, min)))
+    clear = of_k[1, [0, -1]] <= MAX_CLEAR_K
+    first = of_n[0, 0] if clear[0] else max(of_n[0, 0], of_k[0, 0])
+    last = of_n[0, -1] if clear[1] else min(of_n[0, -1], of_k[0, -1])
     if first > last:
         ranges = (f"{table[0, 0] * 1e3:g} to {table[0, -1] * 1e3:g} nm" for table in (of_n, of_k))
         raise RequestError("got n from {} and k from {}, wanted both at the same wavelengths".format(*ranges))
     both = np.union1d(of_n[0], of_k[0])
     both = both[(both >= first) & (both <= last)]
-    return both, np.interp(both, *of_n), np.interp(both, *of_k)
+    return both, np.interp(both, *of_n), np.interp(both, of_k[0], of_k[1], left=0.0, right=0.0)
+
+
+def _doubts(wavelengths: _Table, of_k: _Table | None) -> tuple[Doubt, ...]:
+    """Return where the k of a table of these wavelengths is not that of the file; `of_k` has the rows of the file."""
+    if of_k is None:
+        return ()
+    (first, last), (start, stop) = 1e3 * wavelengths[[0, -1]], 1e3 * of_k[0, [0, -1]]
+    ends = [(first, min(start, last)), (max(stop, first), last)]
+    found = [Doubt(end, f"no k from {_nanometres(end)}, taken as 0") for end in ends if end[0] < end[1]]
+    negative = of_k[0, of_k[1] < 0] * 1e3
+    if negative.size:
+        found.append(Doubt((negative[0], negative[-1]), f"k down to {of_k[1].min():.2g}, taken as 0"))
+    return tuple(found)
 
 
 def _possible_rows(wavelengths: _Table, n: _Table, k: _Table) -> tuple[int, int]:

@@ -1,6 +1,7 @@
 """Refractive indices: names against published values, files as refractiveindex.info and Mitsuba write them."""
 
 import re
+import warnings
 from pathlib import Path
 
 import numpy as np
@@ -176,6 +177,18 @@ PAGES = {
         (210, 2000),
         1.5 + 0.1j,
     ),
+    "glass whose k ends before n": (
+        YML.format("formula 5\n    wavelength_range: 0.4 0.9\n    coefficients: 1.7")
+        + "  - type: tabulated k\n    data: |\n        0.5 1e-5\n        0.7 2e-8\n",
+        (400, 900),
+        1.7 + 5.01e-6j,
+    ),
+    "glass whose k is known elsewhere": (
+        YML.format("formula 5\n    wavelength_range: 0.4 0.9\n    coefficients: 1.7")
+        + "  - type: tabulated k\n    data: |\n        0.28 -0.0\n        0.29 -0.0\n",
+        (400, 900),
+        1.7,
+    ),
     "one row": (NK.format("0.6 1.5 0.1"), (600, 600), 1.5 + 0.1j),
 }
 
@@ -187,6 +200,38 @@ def test_a_page_is_known_where_its_n_and_k_are(tmp_path, page):
     assert found.range == pytest.approx(known)
     assert complex(found(0.6)) == pytest.approx(complex(wanted), abs=1e-12)
     assert not found.is_constant
+
+
+@pytest.mark.parametrize(
+    ("page", "light", "words"),
+    [
+        ("glass whose k ends before n", (480, 690), "no k from 400 to 500 nm, taken as 0"),
+        ("glass whose k ends before n", (690, 710), "no k from 700 to 900 nm, taken as 0"),
+        ("glass whose k ends before n", (500, 700), ""),
+        ("glass whose k is known elsewhere", (450, 460), "no k from 400 to 900 nm, taken as 0"),
+        ("noise about k = 0", (400, 800), "k down to -0.004, taken as 0"),
+        ("noise about k = 0", (400, 500), ""),
+    ],
+)
+def test_k_that_is_taken_as_zero_is_said_each_time(tmp_path, page, light, words):
+    path = write(tmp_path, "a.yml", PAGES[page][0])
+    for _ in range(2):
+        with warnings.catch_warnings(record=True) as caught:
+            warnings.simplefilter("always")
+            index_of("material", path).known("material").check(light)
+        assert [str(one.message) for one in caught] == ([f"material: a.yml has {words}"] if words else [])
+
+
+@pytest.mark.parametrize("name", ["a.yml", "a.csv"])
+def test_a_page_of_the_far_infrared_is_read_in_micrometres(tmp_path, name):
+    # Regression: refused as a table in nm, so that n of 500 µm would have been taken at 500 nm.
+    rows = "200 1.6\n        998 1.7"
+    text = YML.format(f"tabulated n\n    data: |\n        {rows}") if name == "a.yml" else "wl,n\n200,1.6\n998,1.7\n"
+    found = read_index(write(tmp_path, name, text))
+    assert found.range == pytest.approx((2e5, 9.98e5))
+    assert complex(found(599)) == pytest.approx(1.65)
+    with pytest.raises(ValueError, match=r"table of 200000 to 998000 nm .*; wavelengths of \.csv and \.yml are in µm"):
+        refractive_index(0.5, int_ior=str(tmp_path / name), known=True)
 
 
 def test_a_second_file_of_k_that_changes_is_read_again(tmp_path):
@@ -208,11 +253,6 @@ def test_k_of_a_second_file_is_read(tmp_path):
         ("a.spd", "", "got no numbers"),
         ("a.yml", "", "not a table of refractive indices"),
         ("a.csv", "0.4,1.5\n", "wanted a header 'wl,n'"),
-        (
-            "a.csv",
-            "wl,n\n400,1.5\n800,1.6\n",
-            r"got wavelengths from 400 to 800 µm: a table in nm\?",
-        ),
         ("a.spd", "0.4 1.5\n0.8 1.6\n", r"got wavelengths from 0.4 to 0.8 nm: a table in µm\? .spd files have nm"),
         ("a.csv", "wl,n,k\n0.4,1.5,-0.1\n0.8,1.6,0\n", "got k = -0.1, wanted k from 0 to 100"),
         ("a.csv", N + N[5:] + N[5:], "neither ascend nor descend"),
@@ -240,6 +280,30 @@ def test_wrong_files_are_refused_in_one_line(tmp_path, name, text, message):
     assert "\n" not in str(error.value)
     with pytest.raises(FileNotFoundError, match="no such file"):
         read_index(tmp_path / "b.csv")
+
+
+@pytest.mark.parametrize(
+    ("name", "offered"),
+    [
+        *((name, "") for name in ("iron", "steel", "Fe", "Si", "silicon", "Al2O3", "glass")),
+        *(("aluminum", "Al"), ("Alu", "Al"), ("alumnium", "Al"), ("al", "Al"), ("Al_palik", "Al"), ("ag", "Ag")),
+        *(("Ni", "Ni_palik"), ("nickle", "Ni_palik"), ("chrom", "Cr"), ("cu2o", "Cu2O or Cu2O_palik")),
+    ],
+)
+def test_a_conductor_is_offered_by_meaning(name, offered):
+    with pytest.raises(ValueError, match=f"material: got '{name}', ") as error:
+        index_of("material", name)
+    message = str(error.value)
+    if offered:
+        assert message.endswith(f"did you mean {offered}")
+    else:
+        assert "did you mean" not in message
+        assert message.endswith("or a file, such as a page of refractiveindex.info (.yml)")
+
+
+def test_a_metal_that_ends_in_the_infrared_says_where_another_index_is():
+    with pytest.raises(ValueError, match=r"light of 1064 nm, .* \(Al\).* a page of refractiveindex\.info"):
+        refractive_index(1.064, material="Al", known=True)
 
 
 def test_a_file_is_read_again_where_it_has_changed(tmp_path):
