@@ -86,7 +86,7 @@ def efficiency(
             found = efficiencies_of_peaks(cached, below, *light, progress)
         warning = cached.warning
     else:
-        field = requested.recipe.height_field()
+        field = requested.period
         with progress_bar(f"efficiencies of {name}") as progress:
             found = order_efficiencies(field, below, *light, theory, transmission, progress)
             warning = scalar_error(field, below=below).warning if theory == "scalar" else ""

@@ -86,7 +86,7 @@ class ExportedGrating:
                 f"{requested.title}: got an irregular surface, which has no orders, wanted a grating; the command "
                 "`efficiency --csv` tabulates its peaks, and a file .osl holds its spectrum"
             )
-        field = recipe.height_field()
+        field = requested.period
         if is_profile(field):
             field = HeightField(field.heights[:1], field.pixel_size, field.source)
         return cls(field, requested.theory, medium_in_air(recipe.settings.chosen, requested.aside), shortest)

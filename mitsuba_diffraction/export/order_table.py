@@ -26,12 +26,12 @@ theta, phi: light of this polar angle in air travels along (sin theta cos phi, s
 m, n: order along x and y; u, v, w: direction cosines along which the order travels, in its own medium of index N:
 N (u, v) = (sin theta cos phi, sin theta sin phi) - wavelength (m, n)/period; w > 0 of reflected, w < 0 of transmitted
 efficiency: power of the order over the power of the light; s: the electric field of the light is perpendicular to the
-plane of incidence, along z x k; p: along k x (z x k); mean: unpolarised light. Without the transmitted rows, what is
-left of one is absorbed\
+plane of incidence, along z x k, for theta = 0 along its limit (-sin phi, cos phi, 0); p: along k x (z x k); mean:
+unpolarised light. Without the transmitted rows, what is left of one is absorbed\
 """
 _AMPLITUDES = """
-to_s, to_p: complex amplitudes of the s and p waves of the order for light of this row, in the same bases (y, if k is
-along z); their squared moduli add up to the efficiency; fields as exp(-i omega t), phases at the mean height\
+to_s, to_p: complex amplitudes of the s and p waves of the order for light of this row, in the same bases, k along the
+order; their squared moduli add up to the efficiency; fields as exp(-i omega t), phases at the mean height\
 """
 
 

@@ -13,9 +13,10 @@ from ..errors import RequestError, did_you_mean
 from ..progress import Progress, no_progress, say
 from ..settings import SPECTRUM_PARAMETERS, ScalarSettings, Settings
 from ..surface.gratings import RENAMED
+from ..surface.heightfield import HeightField
 from ..surface.prepare import repeats_without_seam
 from .recipe import Recipe, kind_of, source_named
-from .spectra import Spectrum, is_rigorous, load_spectrum
+from .spectra import Spectrum, check_height_range, is_rigorous, load_spectrum
 from .surface_text import parsed
 
 
@@ -158,6 +159,17 @@ class RequestedSurface:
     def is_irregular(self) -> bool:
         """Whether it is an irregular surface, which has no orders."""
         return self.is_spectrum or self.recipe.settings.extent == "sample" or self.recipe.patches > 1
+
+    @property
+    def period(self) -> HeightField:
+        """One period of a grating, for its orders.
+
+        Raises:
+            RequestError: if it is deeper than its `largest_height_range`; others as `recipe`.
+        """
+        heights = self.recipe.height_field()
+        check_height_range(heights, self.recipe.settings)
+        return heights
 
     @property
     def is_film(self) -> bool:

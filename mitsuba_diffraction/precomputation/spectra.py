@@ -87,12 +87,8 @@ def build_spectrum(
     for patch in patches[1:]:
         if patch.shape != first.shape or not np.allclose(patch.tile_size, first.tile_size, rtol=1e-9):
             raise RequestError(f"patches: got {patch!r} beside {first!r}, wanted patches of one size")
-    height_range = max(patch.height_range for patch in patches)
-    if height_range > settings.largest_height_range:
-        raise RequestError(
-            f"heights: got a range of {height_range:.4g} µm, wanted at most {settings.largest_height_range:g}: are "
-            "these nanometres? If the surface is so deep, raise largest_height_range"
-        )
+    for patch in patches:
+        check_height_range(patch, settings)
     if isinstance(settings, ScalarSettings):
         if len(patches) > 1 and settings.representation in SERIES:
             raise RequestError(
@@ -110,6 +106,19 @@ def build_spectrum(
             f"theory: got rigorous and {len(patches)} patches ({first.source}, …), wanted one, of one row"
         )
     return rigorous.build_rigorous(first, settings, progress, cache_folder())
+
+
+def check_height_range(height_field: HeightField, settings: Settings) -> None:
+    """Check that heights are not deeper than the `largest_height_range`, as heights in nm are.
+
+    Raises:
+        RequestError: if they are.
+    """
+    if (height_range := height_field.height_range) > settings.largest_height_range:
+        raise RequestError(
+            f"heights: got a range of {height_range:.4g} µm, wanted at most {settings.largest_height_range:g}: are "
+            "these nanometres? If the surface is so deep, raise largest_height_range"
+        )
 
 
 def check_material(settings: Settings) -> None:

@@ -13,8 +13,9 @@ from .heightfield import HeightField, as_pixel_size
 MAX_PIXELS = 2**26
 """Of a profile: half a gigabyte of heights."""
 
-MAX_PERIOD = 100.0
-"""µm: orders of visible light are 0.3° apart, about the width of the sun. A period given in nm is larger."""
+_MIN_PERIOD, MAX_PERIOD = 1e-3, 100.0
+"""µm: atoms are closer than the first; of the second, orders of visible light are 0.3° apart, about the width of the
+sun. A period or a depth given in nm is larger."""
 
 
 def check_pixels(columns: float, rows: float) -> None:
@@ -30,6 +31,8 @@ def check_positive(name: str, value: float, unit: str = "in µm") -> None:
 
 def check_period(name: str, value: float) -> None:
     check_positive(name, value)
+    if value < _MIN_PERIOD:
+        raise RequestError(f"{name}: got {value!r} µm, wanted at least {_MIN_PERIOD:g}")
     if value > MAX_PERIOD:
         raise RequestError(
             f"{name}: got {value!r} µm, wanted at most {MAX_PERIOD:g}; is it in nm ({value / 1e3:g} µm)? A grating "
@@ -41,6 +44,8 @@ def check_profile(period: float, depth: float, samples: int = 2) -> None:
     check_period("period", period)
     if not (is_number(depth) and depth >= 0):
         raise RequestError(f"depth: got {depth!r}, wanted a number in µm, zero or more")
+    if depth > MAX_PERIOD:
+        raise RequestError(f"depth: got {depth!r} µm, wanted at most {MAX_PERIOD:g}; is it in nm ({depth / 1e3:g} µm)?")
     check_whole("samples", samples, 2)
     check_pixels(samples, 1)
 

@@ -13,6 +13,8 @@ from scipy.sparse.linalg import splu
 
 from ..errors import RequestError
 
+_MIN_PIXEL, _MAX_PIXEL = 1e-9, 1e9  # µm: squares and products of others overflow
+
 
 def as_pixel_size(value: float | tuple[float, float]) -> tuple[float, float]:
     """Return one number or (x, y), in µm, as a pair of positive floats."""
@@ -24,8 +26,10 @@ def as_pixel_size(value: float | tuple[float, float]) -> tuple[float, float]:
         pair = (float(x), float(y))
     except (TypeError, ValueError, OverflowError):
         raise RequestError(f"pixel_size: got {value!r}, wanted one number or (x, y) in µm") from None
-    if not all(np.isfinite(p) and p > 0 for p in pair):
-        raise RequestError(f"pixel_size: got {value!r}, wanted positive numbers in µm")
+    if not all(_MIN_PIXEL <= p <= _MAX_PIXEL for p in pair):
+        raise RequestError(
+            f"pixel_size: got {value!r}, wanted positive numbers in µm, {_MIN_PIXEL:g} to {_MAX_PIXEL:g}"
+        )
     return pair
 
 

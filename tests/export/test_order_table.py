@@ -200,6 +200,7 @@ def test_the_command_writes_a_table(command, tmp_path, monkeypatch):
         ("export blazed --wavelength 5 -o t.csv", "--wavelength: got 5, wanted nm from 10 to"),
         ("export gone.exr -o t.csv", "gone.exr: got a saved spectrum for t.csv, wanted the recipe, the profile"),
         ("export gone.toml -o t.csv", "gone.toml: no such file"),
+        ("export blazed,depth=90 -o t.csv", "heights: got a range of 89.82 µm, wanted at most 20"),
     ],
 )
 def test_a_wrong_command_is_one_line(command, line, message, tmp_path, monkeypatch):
@@ -211,6 +212,26 @@ def test_a_wrong_command_is_one_line(command, line, message, tmp_path, monkeypat
     assert not list(tmp_path.iterdir())
 
 
+@pytest.mark.few(1)
+@pytest.mark.parametrize("phi", [30, 0, 90, 200])
+def test_s_of_light_along_the_normal_is_the_limit_that_the_header_names(phi, tmp_path):
+    grating = md.gratings.sinusoidal(1.0, 0.1)
+    at_normal, near = (table(tmp_path / "n.csv", grating, 600, theta, phi, int_ior=1.5) for theta in (0, 1e-5))
+    names = [f"to_{to}_{part}" for to in "sp" for part in ("re", "im")]
+    for row, other in zip(at_normal, near, strict=True):
+        np.testing.assert_allclose([row[name] for name in names], [other[name] for name in names], atol=1e-6)
+    # Order 0 of light along s has an amplitude along s alone where the grooves are along s or across it.
+    (row,) = chosen(at_normal, m=0, side="reflected", polarisation="s")
+    s = -np.sin(np.deg2rad(phi)), np.cos(np.deg2rad(phi))
+    te, tm = (
+        chosen(table(tmp_path / "n.csv", grating, 600, 0, of, int_ior=1.5), m=0, side="reflected", polarisation="s")[0]
+        for of in (0, 90)
+    )
+    along = s[1] ** 2 * te["to_s_re"] + s[0] ** 2 * tm["to_s_re"]
+    assert row["to_s_re"] == pytest.approx(along, abs=1e-6)
+    assert "(-sin phi, cos phi, 0)" in (tmp_path / "n.csv").read_text()
+
+
 def test_the_far_infrared_of_a_table_adds_no_orders(tmp_path):
     (tmp_path / "glass.csv").write_text("wl,n\n0.3,1.5\n1.1,1.5\n10,30\n")
     tile = md.gratings.crossed(2.0, 0.1, samples=24)
@@ -220,7 +241,8 @@ def test_the_far_infrared_of_a_table_adds_no_orders(tmp_path):
     np.testing.assert_allclose(*([row["efficiency"] for row in rows] for rows in (found, wanted)), atol=1e-8)
 
 
-@pytest.mark.parametrize("theory", ["scalar", "rigorous"])
+@pytest.mark.few(1)
+@pytest.mark.parametrize("theory", ["rigorous", "scalar"])
 def test_glass_transmits_however_it_is_named(theory, command, tmp_path, monkeypatch):
     """A recipe with the index as a number has been right; n at 550 nm of the data sheet."""
     monkeypatch.chdir(tmp_path)

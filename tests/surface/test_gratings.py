@@ -1,5 +1,7 @@
 """Profiles by formula against the analytic orders; synthetic skins against the statistics they promise."""
 
+import inspect
+
 import numpy as np
 import pytest
 from hypothesis import given, settings
@@ -7,6 +9,8 @@ from hypothesis import strategies as st
 from PIL import Image
 from scipy.special import jv
 
+import mitsuba_diffraction as md
+from mitsuba_diffraction.errors import RequestError
 from mitsuba_diffraction.surface.gratings import (
     PROFILES,
     blazed,
@@ -217,6 +221,26 @@ def test_a_period_that_looks_like_nm_is_refused_with_a_question(name):
         PROFILES[name](period=2000, **given)
     with pytest.raises(ValueError, match="period_y: got 1500"):
         PROFILES["crossed"](period=2.0, depth=0.1, period_y=1500)
+
+
+@pytest.mark.parametrize("name", sorted(set(PROFILES) - BY_ANGLE))
+def test_a_depth_that_looks_like_nm_is_refused_with_a_question(name):
+    with pytest.raises(RequestError, match=r"depth: got 250 µm, wanted at most 100; is it in nm \(0.25 µm\)\?"):
+        PROFILES[name](period=2.0, depth=250)
+
+
+@pytest.mark.parametrize("value", [1e-300, 1e-12, 1e5, 1e300])
+def test_no_number_is_too_large_or_small_for_a_refusal_or_for_finite_efficiencies(value):
+    required = {"period": 1.0, "depth": 0.1}
+    for profile in ("blazed", "sinusoidal", "lamellar", "ruled"):
+        parameters = inspect.signature(PROFILES[profile]).parameters.values()
+        base = {one.name: required[one.name] for one in parameters if one.default is one.empty}
+        for one in parameters:
+            try:
+                field = PROFILES[profile](**{**base, one.name: value})
+            except RequestError:
+                continue
+            assert np.isfinite(md.efficiencies(field, [20.0], [500.0]).values).all()
 
 
 @pytest.mark.parametrize("name", sorted(set(PROFILES) - BY_ANGLE))

@@ -230,7 +230,9 @@ def _read(path: Path, channel: str | int | None, unit: str | tuple[str, str] | N
 def _in_unit(read: Scan, unit: str | tuple[str, str], extension: str) -> Scan:
     """Return a scan of a format without units whose lengths are in `unit`."""
     if read.numbers.dtype.kind != "f":
-        raise RequestError(f"unit: got {unit!r} for integers in {extension}, wanted height_range, in µm")
+        raise RequestError(
+            f"unit: got {unit!r} for integers in {extension}, wanted it without: their height_range is in µm"
+        )
     along, high = (micrometres(name, "unit") for name in pair(unit))
     size = None if read.pixel_size is None else (along * read.pixel_size[0], along * read.pixel_size[1])
     return replace(read, numbers=read.numbers * high, pixel_size=size)
