@@ -45,8 +45,15 @@ def blazed(period: float = 2.5, depth: float = 0.246, *, samples: int = 512) -> 
     return one_row(depth * phase(samples), period, f"blazed grating, period {period:g} µm, depth {depth:g} µm")
 
 
-def ruled(lines_per_mm: float = 600.0, *, blaze_wavelength: float = 500.0, samples: int = 512) -> HeightField:
-    """Return a blazed grating, (1, samples), with given lines per millimetre and blaze wavelength λ_B in nm.
+def ruled(
+    lines_per_mm: float = 600.0,
+    *,
+    blaze_wavelength: float | None = None,
+    blaze_angle: float | None = None,
+    blaze_ior: float | None = None,
+    samples: int = 512,
+) -> HeightField:
+    """Return a blazed grating, (1, samples), with given lines per millimetre and blaze wavelength or angle.
 
     At the blaze wavelength the first order in Littrow mounting returns along the normal of the facets, at the blaze
     angle θ_B (Palmer 2020, Diffraction Grating Handbook, chapters 2 and 9). With the period d and the depth D of a
@@ -55,22 +62,50 @@ def ruled(lines_per_mm: float = 600.0, *, blaze_wavelength: float = 500.0, sampl
         λ_B = 2 d sin θ_B,    D = d tan θ_B.
 
     In that mounting κD = 2π, so that scalar theory diffracts all power into the first order. λ_B is below 2 d.
+
+    With `blaze_ior`, the index n of glass, it is blazed for light that a sheet transmits at normal incidence: facets
+    deflect it, as prisms do, into the order at θ,
+
+        λ_B = d sin θ,    n sin θ_B = sin(θ_B + θ).
+
+    Args:
+        lines_per_mm: per millimetre.
+        blaze_wavelength: λ_B, nm; 500 if neither is given.
+        blaze_angle: or θ_B, degrees.
+        blaze_ior: index of the sheet; None for reflected light.
+        samples: pixels.
     """
     check_positive("lines_per_mm", lines_per_mm, "of lines per mm")
-    check_positive("blaze_wavelength", blaze_wavelength, "of nm")
-    if blaze_wavelength < 10:
-        raise RequestError(f"blaze_wavelength: got {blaze_wavelength:g} nm, wanted at least 10 nm, not µm")
+    if blaze_ior is not None and not (is_number(blaze_ior) and 1 < blaze_ior < 10):
+        raise RequestError(f"blaze_ior: got {blaze_ior!r}, wanted an index above 1")
     period = 1000 / lines_per_mm
-    sine = blaze_wavelength * 1e-3 / (2 * period)
-    if sine >= 1:
-        raise RequestError(
-            f"blaze_wavelength: got {blaze_wavelength:g} nm, wanted less than twice the period, {2000 * period:.4g} nm"
-        )
-    angle = np.arcsin(sine)
-    source = f"ruled grating, {lines_per_mm:g} lines/mm, blazed for {blaze_wavelength:g} nm ({np.degrees(angle):.2f}°)"
-    depth = period * np.tan(angle)
+    if blaze_angle is not None:
+        if blaze_wavelength is not None:
+            raise RequestError(f"blaze_angle: got {blaze_angle!r} and blaze_wavelength, wanted one of the two")
+        limit = 90.0 if blaze_ior is None else np.degrees(np.arcsin(1 / blaze_ior))
+        if not (is_number(blaze_angle) and 0 < blaze_angle < limit):
+            raise RequestError(f"blaze_angle: got {blaze_angle!r}, wanted degrees above 0 and below {limit:.4g}")
+        facet = float(np.deg2rad(blaze_angle))
+        path = 2 * np.sin(facet) if blaze_ior is None else np.sin(np.arcsin(blaze_ior * np.sin(facet)) - facet)
+        blaze_wavelength = float(1e3 * period * path)
+    else:
+        blaze_wavelength = 500.0 if blaze_wavelength is None else blaze_wavelength
+        check_positive("blaze_wavelength", blaze_wavelength, "of nm")
+        if blaze_wavelength < 10:
+            raise RequestError(f"blaze_wavelength: got {blaze_wavelength:g} nm, wanted at least 10 nm, not µm")
+        sine = blaze_wavelength * 1e-3 / (period if blaze_ior else 2 * period)
+        if sine >= 1:
+            longest = "the period" if blaze_ior else "twice the period"
+            raise RequestError(
+                f"blaze_wavelength: got {blaze_wavelength:g} nm, wanted less than {longest}, "
+                f"{blaze_wavelength / sine:.4g} nm"
+            )
+        facet = float(np.arcsin(sine) if blaze_ior is None else np.arctan(sine / (blaze_ior - np.sqrt(1 - sine**2))))
+    used = "" if blaze_ior is None else f" in transmission, n = {blaze_ior:g}"
+    source = f"ruled grating, {lines_per_mm:g} lines/mm, blazed for {blaze_wavelength:.4g} nm{used}"
+    depth = period * np.tan(facet)
     check_profile(period, depth, samples)
-    return one_row(depth * phase(samples), period, source)
+    return one_row(depth * phase(samples), period, f"{source} ({np.degrees(facet):.2f}°)")
 
 
 def right_angled(period: float, facet_angle: float, *, samples: int = 512) -> HeightField:

@@ -57,6 +57,24 @@ def test_a_ruled_grating_diffracts_its_blaze_wavelength_into_the_littrow_order(l
     assert eta[1] == pytest.approx(1, abs=1e-4)
 
 
+def test_the_blaze_angle_stands_for_the_blaze_wavelength():
+    # Richardson Gratings' catalogue: 600 lines/mm, 13.9°, 800 nm.
+    by_angle = ruled(600, blaze_angle=13.9)
+    np.testing.assert_allclose(by_angle.heights, ruled(600, blaze_wavelength=800.8).heights, atol=1e-4)
+    assert by_angle.source == "ruled grating, 600 lines/mm, blazed for 800.8 nm (13.90°)"
+    angle = 17.178
+    of_glass = ruled(300, blaze_angle=angle, blaze_ior=1.52), ruled(300, blaze_wavelength=550, blaze_ior=1.52)
+    np.testing.assert_allclose(*(field.heights for field in of_glass), atol=1e-4)
+
+
+def test_a_grating_blazed_in_transmission_transmits_into_one_order():
+    """By rigorous theory, of reflection blazes and of these."""
+    light = {"angles": 0, "wavelengths": 550, "theory": "rigorous", "int_ior": 1.52, "transmission": "sheet"}
+    for blaze_ior, low, high in ((1.52, 0.7, 1.0), (None, 0.0, 0.15)):
+        field = ruled(300, blaze_wavelength=550, blaze_ior=blaze_ior)
+        assert low < md.efficiencies(field, **light).order(-1).mean() < high
+
+
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
@@ -64,6 +82,14 @@ def test_a_ruled_grating_diffracts_its_blaze_wavelength_into_the_littrow_order(l
         ({"lines_per_mm": "600"}, "lines_per_mm: got '600'"),
         ({"blaze_wavelength": 0.8}, "blaze_wavelength: got 0.8 nm, wanted at least 10 nm, not µm"),
         ({"blaze_wavelength": np.nan}, "blaze_wavelength: got nan"),
+        ({"blaze_angle": 90}, "blaze_angle: got 90, wanted degrees above 0 and below 90"),
+        ({"blaze_angle": 60, "blaze_ior": 1.5}, r"blaze_angle: got 60, wanted degrees above 0 and below 41\.81"),
+        (
+            {"blaze_angle": 10, "blaze_wavelength": 500},
+            "blaze_angle: got 10 and blaze_wavelength, wanted one of the two",
+        ),
+        ({"blaze_ior": 1.0}, "blaze_ior: got 1.0, wanted an index above 1"),
+        ({"blaze_ior": 1.5, "blaze_wavelength": 1700}, "got 1700 nm, wanted less than the period, 1667 nm"),
         ({"blaze_wavelength": 4000}, r"blaze_wavelength: got 4000 nm, wanted less than twice the period, 3333 nm"),
         ({"samples": 1}, "samples: got 1"),
     ],
