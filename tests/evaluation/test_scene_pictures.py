@@ -1,8 +1,11 @@
 """The comparison of pictures of a scene with those by Mitsuba, and whether it can fail."""
 
+import functools
+
 import numpy as np
 import pytest
 
+from mitsuba_diffraction.evaluation.validation import scene_pictures
 from mitsuba_diffraction.evaluation.validation.scene_pictures import MAX_DEVIATION, PICTURES, PictureDifference
 
 SCENE = """<scene version="3.0.0">
@@ -74,7 +77,8 @@ def test_a_picture_of_a_single_pixel_is_compared():
 def test_the_command_finds_light_that_is_missing(command, tmp_path, monkeypatch):
     path = tmp_path / "scene.xml"
     path.write_text(SCENE)
-    monkeypatch.setattr("mitsuba_diffraction.evaluation.validation.scene_pictures._SECONDS", 4.0)
+    briefly = functools.partial(scene_pictures.compare_scene, seconds=4.0)
+    monkeypatch.setattr(scene_pictures, "compare_scene", briefly)
     code, out, _ = command("validate", str(path), "-D", "sun=2", "--json", str(tmp_path / "a.json"))
     assert (code, "no difference beyond noise: at most" in out) == (0, True)
     # As if the floor were black.

@@ -33,7 +33,7 @@ MAX_DEVIATION = 6.0  # standard errors
 _BLOCKS = 4  # along each side of a picture
 _BANDS = 3  # of the wavelengths of a spectral film
 _WIDTH = 32  # pixels
-_SECONDS = 30.0
+SECONDS = 30.0
 _ROUNDING = 1e-5  # relative, of sums in single precision
 _TIMED_SPP, _LOG2_SPP = 32, (2, 12)
 
@@ -150,10 +150,16 @@ class SceneComparison:
         return f"{mean}; largest difference: {self._largest}\n{self.difference}"
 
 
-def compare_scene(scene_file: SceneFile, progress: Progress = silent) -> SceneComparison:
-    """Compare the picture that `render` traces of a scene with that by Mitsuba's integrator, in about half a minute.
+def compare_scene(
+    scene_file: SceneFile, progress: Progress = silent, *, seconds: float = SECONDS, first_seed: int = 1
+) -> SceneComparison:
+    """Compare the picture that `render` traces of a scene with that by Mitsuba's integrator.
 
-    The pictures are 32 pixels wide.
+    Args:
+        scene_file: its pictures are traced 32 pixels wide.
+        progress: called after each picture.
+        seconds: that the pictures take, beside the time to compile.
+        first_seed: of 16 in succession.
 
     Raises:
         RequestError: if `render` does not trace the scene by `diffraction_path`, or the scene is wrong.
@@ -177,11 +183,11 @@ def compare_scene(scene_file: SceneFile, progress: Progress = silent) -> SceneCo
         return _in_bands(np.array(mi.render(theirs, integrator=reference, spp=spp, seed=seed)) / weights)
 
     renders = (found, wanted)
-    counts = [_samples_in(_SECONDS / (len(renders) * PICTURES), render) for render in renders]
+    counts = [_samples_in(seconds / (len(renders) * PICTURES), render) for render in renders]
     stacks: list[list[NDArray[np.float64]]] = [[], []]
     for number in range(len(renders) * PICTURES):
         which = number // PICTURES
-        stacks[which].append(renders[which](counts[which], number + 1))
+        stacks[which].append(renders[which](counts[which], first_seed + number))
         progress(number + 1, len(renders) * PICTURES)
     difference = PictureDifference.of(stacks[0], stacks[1])
     return SceneComparison(difference, name, _where(difference, stacks[0][0].shape, ours))
