@@ -41,6 +41,7 @@ class Gratings:
     Attributes:
         shapes: list of `mi.Shape`.
         instanced: those of groups, whose instances do not count.
+        has_mixture: whether a BSDF that transmits light holds others than gratings.
     """
 
     def __init__(self, scene: mi.Scene) -> None:
@@ -53,6 +54,8 @@ class Gratings:
         self.instanced = [shape for shape in members if gratings_in(shape.bsdf())]
         if self.shapes:
             self._choice = mi.DiscreteDistribution([area for _, area in areas])
+        others = [bsdf for shape in self.shapes if not _is_grating_only(bsdf := shape.bsdf())]
+        self.has_mixture = any(bsdf.flags() & +mi.BSDFFlags.GlossyTransmission for bsdf in others)
         ids = [dr.reinterpret_array(mi.UInt32, mi.ShapePtr(shape))[0] for shape in (*self.shapes, *self.instanced)]
         if not ids:
             return
@@ -127,6 +130,7 @@ def _is_grating_only(bsdf: mi.BSDF) -> bool:
 
 _GRATING_PROBABILITY = 0.5  # of a direction to a point on a grating
 _VISIBILITY_TOLERANCE = 1e-3  # relative, of the distance to that point
+_DENSITY_TOLERANCE = 1e-3  # relative, of the density of a sample and that of its direction
 
 
 def define_eye_paths() -> type:
@@ -243,6 +247,9 @@ def define_eye_paths() -> type:
                 active &= ~has_ended
                 unguided = active & (guided ^ True)
                 bs, weight = bsdf.sample(ctx, si_bsdf, sampler.next_1d(active), sampler.next_2d(active), unguided)
+                if dr.hint(self.gratings.has_mixture, mode="scalar"):
+                    density = bsdf.pdf(ctx, si_bsdf, bs.wo, unguided & on_grating)
+                    weight = dr.select(unguided & on_grating & _has_failed(bsdf, bs, density), 0, weight)
                 delta = mi.has_flag(bs.sampled_type, mi.BSDFFlags.Delta)
                 eta *= dr.select(guided, 1, bs.eta)
                 valid |= active & (mi.has_flag(bs.sampled_type, mi.BSDFFlags.Null) ^ True)
@@ -300,6 +307,18 @@ def with_surviving_wavelengths(
     replaced = mi.SurfaceInteraction3f(si)
     replaced.wavelengths = dr.select(active & (throughput <= 0), strongest, si.wavelengths)
     return replaced
+
+
+def _has_failed(bsdf: mi.BSDF, bs: mi.BSDFSample3f, density: mi.Float) -> mi.Bool:
+    """Return whether a sample failed in the part of a BSDF that drew it, but got the value of another part.
+
+    `density` is that of `pdf`. Where a one-sided part of `blendbsdf` is lit from behind, or draws a direction below the
+    horizon, Mitsuba 3.9.1 adds its density, which `pdf` does not hold, and returns the light of the other part once
+    more. `mask` reports densities without its opacity, and is left out.
+    """
+    differs = ~(dr.abs(density - bs.pdf) <= _DENSITY_TOLERANCE * bs.pdf)
+    smooth = ~mi.has_flag(bs.sampled_type, mi.BSDFFlags.Delta)
+    return differs & smooth & ~mi.has_flag(bsdf.flags(), mi.BSDFFlags.Null)
 
 
 def _is_smooth_reflector(bsdf: mi.BSDF) -> mi.Bool:
@@ -562,10 +581,13 @@ class LightPaths:
         cos_ratio_shading = dr.abs(quotient(mi.Frame3f.cos_theta(si.wi), mi.Frame3f.cos_theta(bs.wo)))
         weight *= dr.select(specular, cos_ratio, cos_ratio_shading)
         # Other BSDFs may not be reciprocal, or may perturb the normal themselves. The direction of a failed sample has
-        # no meaning, and may be one in which the perturbed BSDF is not zero.
-        evaluates_reverse = active & (bs.pdf > 0) & ((specular | reciprocal) ^ True)
+        # no meaning, and may be one in which the perturbed BSDF, or another part of it, is not zero.
+        evaluates_reverse = active & ((specular | reciprocal) ^ True)
+        density = bsdf.pdf(ctx, si, bs.wo, evaluates_reverse)
+        active = active & ~(evaluates_reverse & _has_failed(bsdf, bs, density))
+        evaluates_reverse &= active & (bs.pdf > 0)
         value = bsdf.eval(mi.BSDFContext(), _with_wi(si, bs.wo), si.wi, evaluates_reverse)
-        weight = dr.select(evaluates_reverse, value * quotient(1, bsdf.pdf(ctx, si, bs.wo, evaluates_reverse)), weight)
+        weight = dr.select(evaluates_reverse, value * quotient(1, density), weight)
         weight *= dr.abs(quotient(dr.dot(ray.d, si.n), dr.dot(si.to_world(si.wi), si.n)))
         return ray, dr.select(active, weight, 0), specular
 
