@@ -156,7 +156,12 @@ def test_the_code_of_a_page_runs(page, folder, command, llvm, capfd):
         if language == "python":
             run_python(text, names, shown if following == "text" else None, capfd)
         elif language == "sh":
-            run_shell(text, command)
+            printed = run_shell(text, command)
+            if following == "text" and shown.endswith("\n…"):  # the beginning of a table
+                rows = shown.removesuffix("…").splitlines()
+                lines = printed.splitlines()
+                first = [line.split() for line in lines].index(rows[0].split())
+                same("\n".join(lines[first : first + len(rows)]), "\n".join(rows))
         elif language == "console":
             run_console(text, command)
         elif language == "toml":

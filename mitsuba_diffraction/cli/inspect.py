@@ -124,10 +124,7 @@ def _diffraction_lines(inspection: Inspection) -> list[tuple[str, str]]:
         hint = " (for a single period of a grating: extent=tile)" if inspection.extent == "sample" else ""
         lines.append(("period", f"none stands out{hint}"))
     else:
-        sines = [order * GREEN / inspection.periods[0].period for order in range(1, 4)]
-        angles = ", ".join(f"{math.degrees(math.asin(sine)):.1f}°" for sine in sines if sine < 1)
-        orders = f"{angles} (orders 1, 2, … at normal incidence)"
-        lines.append(("550 nm goes to", orders if angles else "no angle: the period is shorter than the wavelength"))
+        lines.append(("550 nm goes to", _angles_of_green(inspection.periods[0].period)))
     lobe = math.degrees(GREEN * lobe_width(inspection.coherence_length))
     length = f"{inspection.coherence_length:.3g} µm"
     if inspection.extent == "sample":
@@ -142,6 +139,18 @@ def _diffraction_lines(inspection: Inspection) -> list[tuple[str, str]]:
         length = f"{inspection.spectrum.coherence_length:.3g} µm"
         lines.append(("colours", f"of the middle {x:.3g} × {y:.3g} µm, at a coherence length of {length}"))
     return lines
+
+
+def _angles_of_green(period: float) -> str:
+    """Return where the first orders of 550 nm leave, of a period in µm: −sin θ_i + m λ/T = sin θ_m."""
+    sines = [order * GREEN / period for order in range(1, 4)]
+    angles = [f"{math.degrees(math.asin(sine)):.1f}°" for sine in sines if sine < 1]
+    if angles:
+        return f"{', '.join(angles)} (orders 1, 2, … at normal incidence)"
+    if sines[0] >= 2:
+        return "no angle: the period is shorter than half the wavelength"
+    first = math.degrees(math.asin(sines[0] - 1))
+    return f"no angle at normal incidence; order 1 back towards the light, from {first:.0f}° incidence on"
 
 
 def _changes_table(inspection: Inspection) -> Table:

@@ -363,18 +363,13 @@ def _keep(scenes: list[mi.Scene], scene: mi.Scene) -> None:
     scenes.append(scene)
 
 
-_GRAIN = {0.02: "not seen", 0.1: "slight grain"}
-"""How noise looks, by its maximum; a step of luminance is seen from one or two per cent on."""
-
-
 def _summary(image: SpectralImage, until_error: float | None, channels: str) -> str:
     """Return size, channels as stored, samples and noise of a picture."""
     rows, columns, _ = image.shape
     text = f"{columns} × {rows} pixels, {channels}, {image.attributes['spp']} samples per pixel"
     if "error" in image.attributes:
         error = float(image.attributes["error"])
-        note = next((seen for bound, seen in _GRAIN.items() if error <= bound), "strong grain")
+        text += f", noise at most {100 * error:.2g} % of the luminance in nine of ten pixels"
         if until_error is not None and error > until_error:
-            note = f"above {100 * until_error:g} %: increase --spp"
-        text += f", noise at most {100 * error:.2g} % of the luminance in nine of ten pixels ({note})"
+            text += f" (above {100 * until_error:g} %: increase --spp)"
     return f"{text}, {image.attributes['variant']}"

@@ -629,3 +629,19 @@ def test_figures_show_y_upwards():
     assert image.origin == "lower"
     bottom, top = axes.get_ylim()
     assert bottom < top
+
+
+@pytest.mark.parametrize(
+    ("period", "said"),
+    [
+        (1.0, "33.4° (orders 1, 2, … at normal incidence)"),
+        # sin θ_m = 0.55/T − sin θ_i is −1 from here on.
+        (0.5, "no angle at normal incidence; order 1 back towards the light, from 6° incidence on"),
+        (0.27, "no angle: the period is shorter than half the wavelength"),
+    ],
+)
+def test_a_report_states_where_green_light_goes(period, said, command, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    code, out, _ = command("inspect", f"sinusoidal,period={period},depth=0.05", "-o", "p.png")
+    assert code == 0
+    assert re.search(rf"^550 nm goes to +{re.escape(said)} *$", out, re.MULTILINE)

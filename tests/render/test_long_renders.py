@@ -428,7 +428,7 @@ def test_the_command_is_interrupted_and_goes_on(command, monkeypatch):
 
     code, out, err = command(f"{LINE} --resume")
     assert (code, err) == (0, "")
-    assert re.search(r"6 samples per pixel, noise at most \d.* pixels \((not seen|slight grain|strong grain)\)", out)
+    assert re.search(r"6 samples per pixel, noise at most \d.* pixels, llvm", out)
     assert files() == {"scene.xml", "out.exr", "out.png"}
     picture = SpectralImage.load("out.exr")
     np.testing.assert_array_equal(picture.radiance, as_saved(render("scene.xml", spp=6)))
