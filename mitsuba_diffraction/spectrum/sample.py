@@ -55,10 +55,12 @@ def effective_coherence_length(height_field: HeightField, requested: float) -> f
     effective = min([float(requested), *(_MAX_COHERENCE_FRACTION * size for size, _, count in axes if count > 1)])
     for _, pixel, count in axes:
         if count > 1 and effective < MIN_PIXELS * pixel * (1 - 1e-9):
-            limit = f", of which the scan of {axes[0][0]:.4g} × {axes[1][0]:.4g} µm supports {effective:.4g}"
+            limit = ""
+            if effective < requested:
+                limit = f", of which the scan of {axes[0][0]:.4g} × {axes[1][0]:.4g} µm supports {effective:.4g}"
             raise RequestError(
-                f"coherence_length: got {requested:g} µm{limit if effective < requested else ''}; wanted at least "
-                f"{MIN_PIXELS} pixels of {pixel:.4g} µm"
+                f"coherence_length: got {requested:g} µm{limit}; wanted at least "
+                f"{MIN_PIXELS} pixels of {pixel:.4g} µm{'' if limit else ': is pixel_size right, in µm?'}"
             )
     return effective
 

@@ -3,6 +3,7 @@
 import struct
 import warnings
 import zlib
+from contextlib import nullcontext
 
 import gwyfile
 import numpy as np
@@ -59,9 +60,9 @@ def png(width, height, bits, colour, data):
 def test_npy_keeps_the_heights(tmp_path_factory, heights, fortran):
     path = tmp_path_factory.mktemp("npy") / "scan.npy"
     np.save(path, np.asfortranarray(heights) if fortran else heights)
-    field = read_height_field(path, pixel_size=(0.1, 0.2))
+    field = read_height_field(path, pixel_size=(1, 2))
     np.testing.assert_array_equal(field.heights, heights)
-    assert field.pixel_size == (0.1, 0.2)
+    assert field.pixel_size == (1, 2)
     assert field.source == "scan.npy"
 
 
@@ -107,7 +108,47 @@ def test_a_tiff_of_this_package_has_its_scale(tmp_path, refuse, size):
     assert field.pixel_size == (0.5, 0.5)
     assert np.ptp(field.heights) == 1.6
     Image.fromarray(counts).save(tmp_path / "other.tif", tiffinfo=tags)
-    refuse("other.tif", "pixel_size, height_range: both missing", pixel_size=None)
+    refuse("other.tif", "height_range: missing for uint16 heights", pixel_size=None)
+
+
+@pytest.mark.parametrize(
+    ("unit", "micrometres"),
+    [("micron", 1), ("um", 1), ("µm", 1), ("\\u00B5m", 1), ("nm", 1e-3), ("mm", 1e3), ("cm", 1e4), ("inch", 25_400)],
+)
+def test_a_tiff_of_imagej_has_the_scale_of_its_description(tmp_path, unit, micrometres):
+    x, y = 0.05 / micrometres, 0.1 / micrometres
+    kind = {"inch": 2, "cm": 3}.get(unit, 1)
+    tags = {270: f"ImageJ=1.54f\nunit={unit}\nmin=0.0\n".encode(), 282: 1 / x, 283: 1 / y, 296: kind}
+    Image.fromarray(HEIGHTS.astype(np.float32)).save(tmp_path / "scan.tif", tiffinfo=tags)
+    assert read_height_field(tmp_path / "scan.tif").pixel_size == pytest.approx((0.05, 0.1), rel=1e-5)
+    assert read_height_field(tmp_path / "scan.tif", 0.2).pixel_size == (0.2, 0.2)
+
+
+def test_a_tiff_that_another_program_wrote_as_imagej_has_its_scale(tmp_path):
+    tifffile = pytest.importorskip("tifffile")
+    heights = HEIGHTS.astype(np.float32)
+    metadata = {"unit": "um"}
+    tifffile.imwrite(tmp_path / "scan.tif", heights, imagej=True, resolution=(1 / 0.05, 1 / 0.1), metadata=metadata)
+    field = read_height_field(tmp_path / "scan.tif")
+    assert field.pixel_size == pytest.approx((0.05, 0.1), rel=1e-5)
+    np.testing.assert_array_equal(field.heights, heights)
+
+
+@pytest.mark.parametrize(("kind", "unit", "micrometres"), [(2, "inch", 25_400), (3, "cm", 1e4)])
+@pytest.mark.parametrize("description", ["", "ImageJ=1.54f\nunit=pixel\n"])
+def test_a_scale_in_the_tags_for_printers_is_taken_with_a_warning(tmp_path, kind, unit, micrometres, description):
+    def save(x, y):
+        tags = {270: description, 282: micrometres / x, 283: micrometres / y, 296: kind}
+        Image.fromarray(HEIGHTS.astype(np.float32)).save(tmp_path / "scan.tif", tiffinfo=tags)
+
+    save(0.05, 0.1)
+    with pytest.warns(UserWarning, match=rf"pixels per {unit} may be meant for a printer: taken .*; pixel_size, in µm"):
+        assert read_height_field(tmp_path / "scan.tif").pixel_size == pytest.approx((0.05, 0.1), rel=1e-5)
+    assert read_height_field(tmp_path / "scan.tif", 0.2).pixel_size == (0.2, 0.2)
+    for idle in (352.8, 1e-5, 25_400):  # 72 dpi, and what no scan has
+        save(idle, idle)
+        with pytest.raises(ValueError, match="pixel_size: the file has none"):
+            read_height_field(tmp_path / "scan.tif")
 
 
 def test_float_tiff_is_in_micrometres(tmp_path):
@@ -653,6 +694,18 @@ def test_gwy_of_great_depth_or_many_parts_is_read_once_from_the_top(tmp_path, re
     monkeypatch.setattr(gwyddion._Bytes, "_value", lambda self, kind: (values.append(kind), read(self, kind))[1])
     refuse("scan.gwy", "got none")
     assert values == ["o", *100_000 * "i"]
+
+
+@pytest.mark.parametrize(("pixel", "doubted"), [(39, True), (0.039, False), (3.9e-4, True), (0.39, False), (4, False)])
+def test_a_pixel_size_that_heights_contradict_is_doubted_by_name(tmp_path, pixel, doubted):
+    x = np.arange(64)
+    heights = 0.1 * np.sin(2 * np.pi * x / 25) + 0.005 * (x[:, None] % 2)
+    np.save(tmp_path / "scan.npy", heights)
+    words = rf"pixel_size: got {pixel:.4g} × {pixel:.4g} µm .*: is it in µm\?"
+    with pytest.warns(UserWarning, match=words) if doubted else nullcontext():
+        read_height_field(tmp_path / "scan.npy", pixel)
+    np.save(tmp_path / "scan.npy", 0 * heights)
+    assert read_height_field(tmp_path / "scan.npy", pixel).height_range == 0
 
 
 # ---------------------------------------------------------------- Gwyddion's simple field

@@ -86,6 +86,9 @@ _EXTENSIONS = (*_WITHOUT_UNIT, *_WITH_CHANNELS, *_WITH_UNIT)
 _OF_MANY_PROGRAMS = (".dat", ".asc", ".csv", ".txt", ".xyz")
 _HEADER_BYTES = 4096  # of a text
 
+# R.m.s. slopes of surfaces are from a hundredth to a few; of pixels in nm taken for µm, a thousandth of that.
+_MIN_SLOPE, _MAX_SLOPE = 3e-3, 30.0
+_COARSE_PIXEL = 1.0  # µm; interferometers see polished surfaces with larger ones, but not what diffracts light
 _UNITS = "unit (unit=um,unit=m: lateral lengths in µm, heights in m)"
 _RANGE = "height_range, in µm,"
 
@@ -165,13 +168,16 @@ def read_height_field(
                 f"{fraction:.2%} of the pixels are coloured, annotation on a grey picture; they can be "
                 "treated as missing, and fill_missing interpolates them from their surroundings"
             )
-        doubt = scan.doubt if pixel_size is None else ""
+        is_given = pixel_size is not None
+        doubt = "" if is_given else scan.doubt
         pixel_size = scan.pixel_size if pixel_size is None else pixel_size
         if pixel_size is None:
             raise RequestError(f"pixel_size: the file has none, wanted one number or (x, y) in µm{hint}")
         source = f"{path.name}, {scan.channel}" if scan.channel else path.name
         field = HeightField(heights, pixel_size, source, fill_missing=fill_missing, keep_missing=keep_missing)
         _check_scale(field, not keep_missing, _RANGE if integers else _UNITS)
+        if is_given:
+            _doubt_pixel_size(field)
     # Pillow raises OSError for a damaged image, the system for unreadable paths (a folder, permissions).
     except (RequestError, OSError, MemoryError) as error:
         raise RequestError(f"{path}: {textwrap.shorten(str(error), _MAX_QUOTE, placeholder=' …')}") from error
@@ -196,6 +202,21 @@ def _check_scale(field: HeightField, levelled: bool, remedy: str) -> None:
         warnings.warn(
             f"{field.source}: got heights of a range of {height_range:.3g} µm, wanted {MIN_HEIGHT_RANGE:g} to "
             f"{MAX_HEIGHT_RANGE:g} µm: is their unit right? {remedy} sets another",
+            stacklevel=3,
+        )
+
+
+def _doubt_pixel_size(field: HeightField) -> None:
+    """Warn of a pixel size that possible heights contradict, as one in nm does."""
+    (x, y), heights = field.pixel_size, field.heights
+    height_range = np.nanmax(heights) - np.nanmin(heights)
+    steps = [np.diff(heights, axis=axis) / pixel for axis, pixel in ((1, x), (0, y))]
+    slope = float(np.sqrt(sum(np.nanmean(step**2) for step in steps if np.isfinite(step).any())))
+    contradicted = (slope < _MIN_SLOPE and max(x, y) > _COARSE_PIXEL) or slope > _MAX_SLOPE
+    if contradicted and MIN_HEIGHT_RANGE <= height_range <= MAX_HEIGHT_RANGE:
+        warnings.warn(
+            f"{field.source}: pixel_size: got {x:.4g} × {y:.4g} µm for heights of a range of "
+            f"{height_range:.3g} µm, an r.m.s. slope of {slope:.2g}: is it in µm?",
             stacklevel=3,
         )
 

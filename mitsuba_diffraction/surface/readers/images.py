@@ -19,6 +19,7 @@ from PIL import Image, UnidentifiedImageError
 from ...errors import RequestError
 from ...files.outputs import MARK
 from ...files.reading import BAD_ARCHIVE, check_array
+from . import scan
 from .scan import DAMAGED, Scan
 
 
@@ -78,6 +79,8 @@ def _load_array(file: IO[bytes], size: int, stored: int) -> NDArray:
         raise RequestError(f"not an array that can be read ({error})") from None
 
 
+_IMAGEJ_UNIT = re.compile(r"^unit=(.+)$", re.MULTILINE)
+_INCH = 25_400.0  # µm
 _HEIGHT_RANGE = re.compile(r"^height_range_um=(\d+\.?\d*(?:e[-+]?\d+)?)$", re.MULTILINE)
 MAX_ANNOTATION_FRACTION = 0.25  # of pixels that are coloured, such as a scale bar; a colour map has more
 
@@ -103,8 +106,8 @@ def read_image(path: Path) -> Scan:
                 if pages != 1:
                     raise RequestError(f"got {pages} pages or frames, wanted one")
                 check_array(picture.size, path.stat().st_size)
-                pixel_size, height_range = _own_scale(picture)
-                return Scan(_numbers_of(picture), pixel_size, height_range=height_range)
+                pixel_size, doubt = _pixel_size(picture)
+                return Scan(_numbers_of(picture), pixel_size, doubt=doubt, height_range=_own_height_range(picture))
         except UnidentifiedImageError:
             raise RequestError("not a PNG or TIFF picture that can be read") from None
         except (Image.DecompressionBombError, Image.DecompressionBombWarning) as error:
@@ -118,16 +121,42 @@ def read_image(path: Path) -> Scan:
             raise RequestError(f"a damaged picture ({type(error).__name__}: {error})") from None
 
 
-def _own_scale(picture: Image.Image) -> tuple[tuple[float, float] | None, float | None]:
-    """Return pixel size and height range, µm, of a TIFF that this package wrote (`inverse_design/output.py`)."""
+def _own_height_range(picture: Image.Image) -> float | None:
+    """Return the height range, µm, of a TIFF that this package wrote (`inverse_design/output.py`)."""
     if picture.format != "TIFF" or picture.tag_v2.get(305) != MARK:
-        return None, None
+        return None
     found = _HEIGHT_RANGE.search(str(picture.tag_v2.get(270, "")))
-    resolution = [float(picture.tag_v2.get(tag, 0)) for tag in (282, 283)]
-    if found is None or picture.tag_v2.get(296) != 3 or min(resolution) <= 0:
-        return None, None
-    # Pixels per cm.
-    return (1e4 / resolution[0], 1e4 / resolution[1]), float(found[1])
+    return None if found is None else float(found[1])
+
+
+def _pixel_size(picture: Image.Image) -> tuple[tuple[float, float] | None, str]:
+    """Return the pixel size (x, y), µm, of a TIFF, None if it has none that a scan can have, and `Scan.doubt`.
+
+    The tags 282 and 283 are pixels per unit: the unit in the description, if ImageJ wrote it, or else an inch or a
+    centimetre (296). Other programs set these for printers, whatever the pixels are.
+    """
+    if picture.format != "TIFF":
+        return None, ""
+    tags = picture.tag_v2
+    resolution = [float(tags.get(tag, 0)) for tag in (282, 283)]
+    # Pillow decodes it as Latin-1.
+    description = scan.decoded(str(tags.get(270, "")).encode("latin-1", errors="replace"))
+    named = _IMAGEJ_UNIT.search(description) if description.startswith("ImageJ=") else None
+    unit = named[1].strip().replace("\\u00B5", "µ") if named else ""
+    sure = unit == "inch" or scan.is_length(unit) or tags.get(305) == MARK
+    if not sure or not unit:
+        unit = {2: "inch", 3: "cm"}.get(tags.get(296, 2), "")
+    # NaN, as of 0/0, is not positive.
+    if not (unit and all(number > 0 for number in resolution)):
+        return None, ""
+    length = _INCH if unit == "inch" else scan.micrometres(unit, "unit")
+    size = length / resolution[0], length / resolution[1]
+    if sure:
+        return size, ""
+    if not scan.is_possible_size(size, picture.size[::-1]):
+        return None, ""
+    of_tags = f"{resolution[0]:.6g} × {resolution[1]:.6g} pixels per {unit}"
+    return size, f"{of_tags} may be meant for a printer: taken as its scale"
 
 
 def _numbers_of(picture: Image.Image) -> NDArray:
