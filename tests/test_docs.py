@@ -96,7 +96,7 @@ def run_shell(text, command, wanted=0, reduced=True):
         name, *words = words
         assert name == "mitsuba-diffraction", line
         options = dict(REDUCED.get(words[0], {}) if reduced and "--width 64" not in line else {})
-        if "--orbit" in words:
+        if "--frames" in words:
             options["--frames"] = "2"
         if reduced and words[0] == "precompute":
             words[1] = re.sub(",tolerance=[^,]*", "", words[1]) + ",tolerance=0.05"

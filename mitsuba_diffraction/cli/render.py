@@ -1,4 +1,4 @@
-"""`mitsuba-diffraction render`: a spectral picture of a scene, or one per camera position of an orbit."""
+"""`mitsuba-diffraction render`: a spectral picture of a scene, or those of an animation."""
 
 from __future__ import annotations
 
@@ -95,8 +95,16 @@ def render(
         str | None, typer.Option(metavar="ADDRESS", help="distribute the passes over a Dask cluster (tcp://HOST:PORT)")
     ] = None,
     # 3600 frames are a tenth of a degree apart, and last five minutes.
-    frames: Annotated[int | None, typer.Option(min=2, max=3600, metavar="N", help="frames of --orbit")] = None,
-    orbit: Annotated[bool, typer.Option("--orbit", help="render pictures of one orbit around the scene")] = False,
+    frames: Annotated[
+        int | None,
+        typer.Option(
+            min=2,
+            max=3600,
+            metavar="N",
+            help="pictures of an animation: of --orbit, or of values first:last (-D turn=0:90)",
+        ),
+    ] = None,
+    orbit: Annotated[bool, typer.Option("--orbit", help="with --frames, move the camera around the scene")] = False,
     overwrite: Overwrite = False,
 ) -> None:
     """Path-trace a scene into a spectral picture (.exr) with a preview (.png), or into a picture alone (.png, .jpg)."""
@@ -107,21 +115,26 @@ def render(
     _check_output(output, stored)
     with named_as_options({"view": "--view"}):
         shown = neutral_view if view is None else ocio_view(view)
-    if (frames is not None) != orbit:
-        raise RequestError("--frames N and --orbit go together")
+    if orbit and frames is None:
+        raise RequestError("--orbit: wanted --frames N with it")
 
     import mitsuba as mi
 
+    from ..render.animation import animations_of, frames_of, save_animation
+    from ..render.animation import orbit as motions_of_orbit
     from ..render.cluster import trace_on
     from ..render.passes import deferred_interrupt, trace_locally
     from ..render.scene_file import SceneFile
+    from ..render.scene_materials import check_materials
     from ..render.sums import checkpoint_path
-    from ..render.turntable import animations_of, save_animation
-    from ..render.turntable import orbit as motions_of_orbit
     from ..variants import choose_variant
 
     scene_file = SceneFile(scene, scene_parameters(define), materials_of(material), (width, height))
-    reads = scene_file.files()
+    scene_files = [scene_file] if frames is None else frames_of(scene_file, frames)
+    if frames is not None and not orbit and scene_files[0] == scene_files[-1]:
+        raise RequestError("--frames N: wanted --orbit, or a value that changes, such as -D turn=0:90")
+    scene_file = scene_files[0]
+    reads = [*scene_file.files(), *scene_files[-1].files()]
     target = output or Path(free_name(scene.stem, lambda stem: _outputs(Path(f"{stem}.exr"), frames), reads) + ".exr")
     check_outputs(reads, [("-o", path) for path in _outputs(target, frames)], overwrite=overwrite)
     checkpoints = [path for path in map(checkpoint_path, _pictures(target, frames)) if path.exists()]
@@ -135,7 +148,9 @@ def render(
     named = None if spp else scene_file.sample_count()
     spp = spp or named or 64
     tracer = trace_locally if dask is None else trace_on(dask)
-    motions = [None] if frames is None else motions_of_orbit(scene_file, frames)
+    with scene_files[-1].parsed():  # before all others are rendered
+        check_materials(scene_files[-1].materials)
+    motions = motions_of_orbit(scene_file, len(scene_files)) if orbit else [None] * len(scene_files)
     alpha = scene_file.has_alpha()
     if alpha and target.suffix.lower() == ".jpg":
         raise RequestError(f"-o: got {target}, but the scene has alpha, which JPEG has not; wanted .exr or .png")
@@ -149,10 +164,10 @@ def render(
     # By default all pictures have the exposure of the first.
     factor = None if exposure is None else 2**exposure
     with durations(), named_as_options({"until_error": "--until-error", "spp": "--spp"}):
-        for number, (path, motion) in enumerate(zip(pictures, motions, strict=True)):
+        for number, (path, frame, motion) in enumerate(zip(pictures, scene_files, motions, strict=True)):
             begin = time.perf_counter()
             factor = _picture(
-                scene_file.moved(motion),
+                frame.moved(motion),
                 path,
                 request,
                 resume=resume,
@@ -256,7 +271,7 @@ def _outputs(target: Path, frames: int | None) -> list[Path]:
     previews = [_preview(path) for path in pictures if _is_spectral(path)]
     if frames is None:
         return [*pictures, *previews]
-    from ..render.turntable import animations_of
+    from ..render.animation import animations_of
 
     return [*pictures, *previews, *animations_of(target)]
 

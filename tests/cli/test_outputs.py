@@ -19,9 +19,9 @@ from mitsuba_diffraction.files.writing import is_intact, refuse_unwritable, seal
 from mitsuba_diffraction.inverse_design import Design, makers, output
 from mitsuba_diffraction.inverse_design.plate import Plate
 from mitsuba_diffraction.inverse_design.target import wanted_fractions
+from mitsuba_diffraction.render.animation import save_animation
 from mitsuba_diffraction.render.scene_file import SceneFile
 from mitsuba_diffraction.render.spectral_image import SpectralImage, save_preview
-from mitsuba_diffraction.render.turntable import save_animation
 from mitsuba_diffraction.spectrum import exr
 
 BLAZE = """[surface]

@@ -1,4 +1,4 @@
-"""Long renderings: stopping by noise, kills, Ctrl-C, full disks, and the turntable."""
+"""Long renderings: stopping by noise, kills, Ctrl-C, full disks, and animations."""
 
 import importlib
 import itertools
@@ -21,12 +21,12 @@ from mitsuba_diffraction.files.writing import exclusive, is_intact, seal
 from mitsuba_diffraction.optics.color import spectrum_to_XYZ
 from mitsuba_diffraction.render import SpectralImage, passes, render
 from mitsuba_diffraction.render import sums as sums_of_passes
+from mitsuba_diffraction.render.animation import frames_of, orbit
 from mitsuba_diffraction.render.passes import Interrupted
 from mitsuba_diffraction.render.scene_file import SceneFile
 from mitsuba_diffraction.render.spectral_film import channel_wavelengths
 from mitsuba_diffraction.render.spectral_image import save_preview, stored_digest
 from mitsuba_diffraction.render.sums import Accumulation, error_of_picture, load_checkpoint, save_checkpoint
-from mitsuba_diffraction.render.turntable import orbit
 
 SIZE = 16
 SCENE = f"""<scene version="3.0.0"><default name="red" value="0.5"/><integrator type="path"/>
@@ -630,7 +630,7 @@ def test_a_checkpoint_is_the_old_one_until_the_new_one_is_whole(monkeypatch):
     assert Path("c").read_bytes() == whole
 
 
-# --- the turntable ---
+# --- animations ---
 
 
 def camera(motion, scene="scene.xml"):
@@ -732,8 +732,68 @@ def test_a_turntable_of_pictures_alone(command, monkeypatch):
     assert (code, out.count("complete, nothing to do")) == (0, 2)
 
 
-@pytest.mark.parametrize("options", ["--frames 3", "--orbit", "--frames 1 --orbit", "--frames 1000000 --orbit"])
-def test_turntables_need_both_options(command, options):
+MOVING = SCENE.replace("RFILTER", "box").replace('x="2" y="-1" z="2"', 'value="$lamp"')
+
+
+def test_values_run_from_the_first_to_the_last_frame():
+    grating = {"profile": "sinusoidal", "period": "2:3", "depth": 0.2, "theory": "a:b"}
+    scene = {"red": "1:0", "lamp": "2, -1, 2:-2,-1,4", "lines": "588:0, 589:1", "name": "C:x", "spp": "4"}
+    frames = frames_of(SceneFile("scene.xml", scene, {"g": grating}), 5)
+    assert [frame.parameters["red"] for frame in frames] == ["1", "0.75", "0.5", "0.25", "0"]
+    assert [frame.parameters["lamp"] for frame in frames[::2]] == ["2, -1, 2", "0, -1, 3", "-2, -1, 4"]
+    assert [frame.materials["g"]["period"] for frame in frames] == [2, 2.25, 2.5, 2.75, 3]
+    rest = {name: scene[name] for name in ("lines", "name", "spp")}
+    for frame in frames:
+        assert rest.items() <= frame.parameters.items()
+        assert frame.materials["g"] == {**grating, "period": frame.materials["g"]["period"]}
+
+
+def test_a_lamp_moves_and_an_interrupted_film_of_it_resumes(command, monkeypatch):
+    Path("scene.xml").write_text(MOVING.replace("<integrator", '<default name="lamp" value="2, -1, 2"/><integrator'))
+    line = f"{RENDER} -o out.exr --float --frames 3 -D lamp=2,-1,2:-2,-1,4 -D red=1:0 --spp 2"
+    press_ctrl_c(monkeypatch, 3)
+    code, _, err = command(line)
+    assert (code, "out_001.exr.checkpoint" in files()) == (130, True), err
+    code, out, err = command(f"{line} --resume")
+    assert (code, err) == (0, "")
+    expected = {f"out_{number:03d}.{kind}" for number in range(3) for kind in ("exr", "png")}
+    assert files() == {"scene.xml", "out.webp", "out.gif", "out.mp4", *expected}
+    assert len({line.split("exposed by ")[1] for line in out.splitlines() if "exposure" in line}) == 1
+    for number, (lamp, red) in enumerate([("2,-1,2", "1"), ("0,-1,3", "0.5"), ("-2,-1,4", "0")]):
+        still = render(SceneFile("scene.xml", {"lamp": lamp, "red": red}), spp=2).radiance
+        np.testing.assert_array_equal(SpectralImage.load(f"out_{number:03d}.exr").radiance, still)
+
+
+@pytest.mark.slow
+def test_a_grating_and_the_camera_change_at_once(command):
+    Path("scene.xml").write_text(SCENE.replace("RFILTER", "box").replace('"diffuse"', '"diffuse" id="g"'))
+    grating = {
+        "profile": "sinusoidal",
+        "period": 2.0,
+        "material": "Al",
+        "coherence_length": 3.0,
+        "conserve_energy": False,
+    }
+    text = ",".join(f"{name}={value}" for name, value in grating.items() if name != "profile")
+    line = f"{RENDER} -o out.exr --float --frames 3 --orbit --spp 1"
+    code, _, err = command(f"{line} --material g=sinusoidal,{text},depth=0.1:-0.3")
+    assert (code, len(err.splitlines())) == (2, 1)
+    assert "depth: got -0.3, wanted a number" in err
+    code, _, err = command(f"{line} --material g=sinusoidal,{text},depth=0.1:0.3")
+    assert code == 0, err
+    motion = orbit(SceneFile("scene.xml"), 3)[1]
+    still = render(SceneFile("scene.xml", materials={"g": {**grating, "depth": 0.2}}, motion=motion), spp=1).radiance
+    np.testing.assert_array_equal(SpectralImage.load("out_001.exr").radiance, still)
+
+
+@pytest.mark.parametrize(
+    "options",
+    [
+        *("--frames 3", "--orbit", "--frames 1 --orbit", "--frames 1000000 --orbit"),
+        *("--frames 3 -D red=0.5", "--frames 3 -D red=1:1"),
+    ],
+)
+def test_an_animation_needs_frames_and_something_that_changes(command, options):
     code, out, err = command(f"{LINE} {options}")
     assert (code, out) == (2, "")
     assert len(err.splitlines()) == 1

@@ -1,4 +1,4 @@
-"""Turntable animations: a camera that orbits the scene."""
+"""Animations: a camera that orbits the scene, and parameters that change from frame to frame."""
 
 from __future__ import annotations
 
@@ -9,21 +9,70 @@ from contextlib import suppress
 from dataclasses import replace
 from pathlib import Path
 from tempfile import TemporaryFile
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import mitsuba as mi
 import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
+from ..errors import RequestError
 from ..files.outputs import MARK
 from ..files.writing import encoded_file, whole_file
+from ..precomputation.surface_text import converted
 from .scene_file import SceneFile
 
 if TYPE_CHECKING:
     from PIL import Image
 
 _FRAMES_PER_SECOND = 12
+
+
+def frames_of(scene_file: SceneFile, count: int) -> list[SceneFile]:
+    """Return the scene of each frame, without the motion of an `orbit`.
+
+    Of a parameter of the scene, or of a grating that replaces a BSDF, that is a text `first:last` of two numbers, or of
+    two vectors of equal length, frame k has the value first + k (last − first)/(count − 1).
+
+    Raises:
+        RequestError: if a text has two vectors of different lengths.
+    """
+    values = [scene_file.parameters, *scene_file.materials.values()]
+    if not any(_ends(value) for table in values for value in table.values()):
+        return [scene_file] * count  # parsed once
+    at = [k / (count - 1) for k in range(count)]
+    return [
+        replace(
+            scene_file,
+            parameters={name: str(_between(v, fraction)) for name, v in scene_file.parameters.items()},
+            materials={
+                bsdf: {name: _between(v, fraction) for name, v in grating.items()}
+                for bsdf, grating in scene_file.materials.items()
+            },
+        )
+        for fraction in at
+    ]
+
+
+def _ends(value: object) -> tuple[NDArray[np.float64], NDArray[np.float64]] | None:
+    """Return the numbers of a text `first:last`; None of another value."""
+    if not isinstance(value, str) or value.count(":") != 1:
+        return None
+    try:
+        first, last = (np.array(part.replace(",", " ").split(), np.float64) for part in value.split(":"))
+    except ValueError:
+        return None
+    if first.size != last.size:
+        raise RequestError(f"{value}: got {first.size} and {last.size} numbers, wanted first:last of as many")
+    return first, last
+
+
+def _between(value: Any, fraction: float) -> Any:
+    """Return a value between its ends, as a number or as a text of several; others as they are."""
+    if (ends := _ends(value)) is None:
+        return value
+    texts = [f"{x:.9g}" for x in ends[0] + fraction * (ends[1] - ends[0])]
+    return converted(texts[0]) if len(texts) == 1 else ", ".join(texts)
 
 
 def orbit(scene_file: SceneFile, frames: int) -> list[tuple[float, ...]]:
@@ -59,7 +108,7 @@ def _view(scene: mi.Scene) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
 
 
 def animations_of(path: Path) -> list[Path]:
-    """Return the animations of an orbit: a WebP, a GIF and, with the package imageio-ffmpeg, an MP4."""
+    """Return the animations beside a picture: a WebP, a GIF and, with the package imageio-ffmpeg, an MP4."""
     films = [".mp4"] if importlib.util.find_spec("imageio_ffmpeg") else []
     return [path.with_suffix(suffix) for suffix in (".webp", ".gif", *films)]
 
