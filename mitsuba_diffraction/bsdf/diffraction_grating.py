@@ -245,6 +245,7 @@ def define() -> type:
 
         def parameters_changed(self, keys: Sequence[str] = ()) -> None:
             self.layers.parameters_changed(list(keys))
+            self.spectrum = self.layers.grating.spectrum
 
         def eval_pdf(
             self, ctx: mi.BSDFContext, si: mi.SurfaceInteraction3f, wo: mi.Vector3f, active: mi.Bool = True

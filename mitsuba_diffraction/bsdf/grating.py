@@ -12,6 +12,7 @@ import numpy as np
 from ..errors import RequestError
 from ..precomputation.recipe import Recipe
 from ..progress import progress_bar
+from ..settings import VISIBLE
 from .device_tables import BELOW_ONE, larger, limited, opaque, smaller
 from .directions import Geometry, Incidence, Interface, rotated
 from .energy_factor import Coordinates
@@ -23,6 +24,7 @@ from .varying import check_texture
 # Of defensive samples, for lobes that the averages of the sampler miss. They are uniform in solid angle: where both
 # directions are grazing, K G grows so fast that samples in proportion to the cosine would have large weights.
 UNIFORM_PROBABILITY = 0.02
+SCALE_MARGIN = 1.2  # of a growing `lateral_scale`, so that a search computes the spectrum once
 _per_cent = functools.partial(progress_bar, unit="%")
 _ROUND = "Sphere", "Cylinder", "BSplineCurve"  # shape types, which are bits
 _Pair = tuple[Geometry, Incidence, tuple[Coordinates, Coordinates] | None]
@@ -84,11 +86,14 @@ class Grating:
             recipe = self._request.widened(wavelengths)
             if recipe is None:
                 raise
-            self.recipe, self.spectrum = recipe, recipe.cached(_per_cent)
-            self.theory = theory_of(self.spectrum, self._request)
-            # The user may have changed the parameters since the request.
-            self.theory.parameters_changed([])
+            self._compute(recipe)
             self.theory.cover(wavelengths)
+
+    def _compute(self, recipe: Recipe) -> None:
+        """Take the spectrum of a recipe, with the parameters that the user may have changed since the request."""
+        self.recipe, self.spectrum = recipe, recipe.cached(_per_cent)
+        self.theory = theory_of(self.spectrum, self._request)
+        self.theory.parameters_changed([])
 
     def _check_window(self, wavelength: float) -> None:
         """Check that a window of the coherence length has a far field at a wavelength in air, nm.
@@ -113,7 +118,26 @@ class Grating:
         """Check the parameters `keys` and recompute what depends on them; without keys, all parameters."""
         if not keys or "orientation" in keys:
             check_texture("orientation", self.orientation)
+        if not keys or "lateral_scale" in keys:
+            self._cover_lateral_scale()
         self.theory.parameters_changed(keys)
+
+    def _cover_lateral_scale(self) -> None:
+        """Compute the spectrum of a recipe again where the scale of lengths has grown beyond what it covers.
+
+        Orders that do not overlap, which alone can be scaled, are computed in about a second.
+        """
+        _, lateral = self.scales
+        lateral.read()
+        light, scale = self.theory.light, float(lateral.values[-1])
+        first, last = light or VISIBLE
+        is_covered = scale <= 1 or first / scale >= self.theory.wavelengths[0] * (1 - 1e-6)
+        if is_covered or not self.theory.scattering.resolved:
+            return
+        if (recipe := self._request.widened((first, last), scale * SCALE_MARGIN)) is not None:
+            self._compute(recipe)
+            if light is not None:
+                self.theory.cover(light)
 
     def traverse(self, callback: mi.TraversalCallback) -> None:
         callback.put("orientation", self.orientation, mi.ParamFlags.Differentiable)

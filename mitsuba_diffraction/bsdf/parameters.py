@@ -423,6 +423,7 @@ class GratingRequest:
     Attributes:
         media: around the grating.
         scales: of heights and of lengths along the surface; one in rigorous theory.
+        scale: the maximum of both, for which a recipe in `surface` is made.
         orientation: degrees from the tangent to the pattern's x axis.
         from_radius: whether they are from the radius, away from the centre of the surface, instead.
         material: R of scalar theory.
@@ -436,6 +437,7 @@ class GratingRequest:
 
     media: Media
     scales: Scales
+    scale: float
     orientation: mi.Texture
     from_radius: bool
     material: Material
@@ -456,14 +458,17 @@ class GratingRequest:
         settings = self.surface.settings if isinstance(self.surface, Recipe) else None
         return medium_below(settings).known if isinstance(settings, RigorousSettings) else ()
 
-    def widened(self, wavelengths: tuple[float, float]) -> Recipe | None:
-        """Return the recipe for light of these wavelengths in air, nm; None for one that sets its own, or a file."""
+    def widened(self, wavelengths: tuple[float, float], scale: float = 1.0) -> Recipe | None:
+        """Return the recipe for light of these wavelengths in air, nm; None for one that sets its own, or a file.
+
+        It covers the scales of the scene, and `scale`.
+        """
         if not isinstance(self.surface, Recipe):
             return None
-        settings, scale = self.surface.settings, self.scales.max_scale
-        of_visible, of_scene = (_next_to_relief(settings.theory, self.media, scale, w) for w in (VISIBLE, wavelengths))
-        if settings.wavelengths != of_visible:
+        settings = self.surface.settings
+        if settings.wavelengths != _next_to_relief(settings.theory, self.media, self.scale, VISIBLE):
             return None
+        of_scene = _next_to_relief(settings.theory, self.media, max(scale, self.scales.max_scale), wavelengths)
         return replace(self.surface, settings=replace(settings, wavelengths=of_scene))
 
     @classmethod
@@ -486,7 +491,8 @@ class GratingRequest:
             orientation = props.get_texture("orientation", 0.0)
         check_texture("orientation", orientation)
         bare = reflectance_from(props, media.coat)
-        surface, stated = surface_from(props, media, bare, scales.max_scale), None
+        scale, stated = scales.max_scale, None
+        surface = surface_from(props, media, bare, scale)
         if _theory_of(surface) == "rigorous":
             _refuse_scalar_only(props)
             # With a coat, `ext_ior` is the index above the coat.
@@ -504,6 +510,7 @@ class GratingRequest:
         return cls(
             media=media,
             scales=scales,
+            scale=scale,
             orientation=orientation,
             from_radius=from_radius,
             material=material,

@@ -4,8 +4,21 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 import pytest
-from bsdf_support import array, bitmap, direction, floats, grating, hemisphere, interaction, towards, uniform, vectors
+from bsdf_support import (
+    array,
+    bitmap,
+    direction,
+    floats,
+    grating,
+    hemisphere,
+    interaction,
+    of_spectrum,
+    towards,
+    uniform,
+    vectors,
+)
 
+import mitsuba_diffraction as md
 from mitsuba_diffraction.bsdf import shared
 
 ORDERS = [(a, 0) for a in range(-3, 4)]
@@ -95,6 +108,46 @@ def test_the_derivative_by_a_number_is_that_of_differences(case, mode):
         found = dr.grad(x)[0]
     assert abs(wanted) > 1e-3
     np.testing.assert_allclose(found, wanted, rtol=0.01)
+
+
+def test_the_derivative_by_lengths_lacks_orders_that_cross_the_horizon():
+    """Summed over directions: that of differences, for pairs between whose orders none appears or vanishes.
+
+    An order is at the horizon where (c ± x) T s/λ of one of the directions is a whole number, c² = 1 − y².
+    """
+    period, at, step, wavelengths = 2.0, 0.97, 1e-3, (430.0, 500.0, 570.0, 640.0)
+    spectrum = md.precompute(md.gratings.sinusoidal(period, 0.25), coherence_length=16.0)
+    bsdf = mi.load_dict(of_spectrum(spectrum, material="Al", conserve_energy=False))
+    wi, parameters = direction(80, 0), mi.traverse(bsdf)
+    x, y = np.meshgrid(np.linspace(-0.9999, 0.9999, 6000), np.linspace(-0.1, 0.1, 9))
+    wo = np.stack([x, y, np.sqrt(np.maximum(1 - x**2 - y**2, 0))], axis=-1)[x**2 + y**2 < 1]
+    si = interaction(np.tile(wi, (len(wo), 1)), wavelengths, len(wo))
+
+    def values(scale):
+        parameters["lateral_scale"] = scale
+        parameters.update()
+        return bsdf.eval(mi.BSDFContext(), si, vectors(wo))
+
+    def orders(scale, omega):
+        c, size = np.hypot(omega[..., 0], omega[..., 2]), period * scale / (1e-3 * np.array(wavelengths)[:, None])
+        return np.floor([(c - omega[..., 0]) * size, (c + omega[..., 0]) * size])
+
+    def sums(f, pairs=True):
+        return np.where(pairs, array(f, np.float64) / wo[:, 2], 0).sum(axis=1)
+
+    s = mi.Float(at)
+    dr.enable_grad(s)
+    f = values(s)
+    dr.forward(s)
+    found, total = dr.grad(f), sums(dr.detach(f))
+    wanted = difference(lambda scale: array(values(scale), np.float64), at, step)
+    first, last = at - 2 * step, at + 2 * step
+    of_wo, of_wi = ((orders(first, each) == orders(last, each)).all(axis=0) for each in (wo, wi[None]))
+    same = of_wo & of_wi
+    assert of_wi.all()
+    np.testing.assert_allclose(sums(found, same) / total, sums(wanted, same) / total, atol=5e-3)
+    # The sum over all directions is wrong at grazing incidence.
+    assert (np.abs(sums(found) - sums(wanted)) > total).all()
 
 
 @pytest.mark.parametrize("key", ["eta.values", "k.values"])

@@ -140,6 +140,24 @@ def test_a_lateral_scale_of_one_costs_nothing_and_can_be_changed(llvm, given):
     np.testing.assert_allclose(evaluate(bsdf, WI, wo)[0], evaluate(plugin(of, lateral_scale=0.8), WI, wo)[0], rtol=1e-5)
 
 
+def test_a_profile_is_scaled_up_as_well_as_down(llvm):
+    """Its spectrum is computed once for a search that goes up, and is that of the longer period."""
+    profile = {"type": "diffraction_grating", "profile": "blazed", "depth": 0.25, "conserve_energy": False}
+    bsdf = mi.load_dict({**profile, "period": PERIOD})
+    bsdf.cover((380.0, 780.0))
+    parameters, spectra = mi.traverse(bsdf), [bsdf.spectrum]
+    for scale in (1.1, 1.25):
+        parameters["lateral_scale"] = scale
+        parameters.update()
+        spectra.append(bsdf.spectrum)
+        wo = near_orders(scale, LINE)
+        wanted = evaluate(mi.load_dict({**profile, "period": PERIOD * scale}), WI, wo)[0]
+        np.testing.assert_allclose(evaluate(bsdf, WI, wo)[0], wanted, rtol=2e-3, atol=1e-3 * wanted.max())
+    assert spectra[1] is not spectra[0]
+    assert spectra[1] is spectra[2]
+    assert bsdf.layers.grating.lacks((380.0, 780.0)) == []
+
+
 def test_a_derivative_by_lengths_of_orders_that_overlap_is_refused(llvm):
     parameters = mi.traverse(plugin(for_scales(SURFACES["blazed"](), 1, coherence_length=5.0)))
     dr.enable_grad(parameters["lateral_scale"])
