@@ -112,9 +112,9 @@ def received(light):
     return (np.concatenate([np.array(pair[k]) for pair in light]) for k in range(2))
 
 
-def by_path(built, depth=2, count=2**18, seed=1):
+def by_path(built, depth=2, count=2**18, seed=1, integrator="path"):
     sampler, ray, weight = rays(built, count, seed)
-    path = mi.load_dict({"type": "path", "max_depth": depth})
+    path = mi.load_dict({"type": integrator, "max_depth": depth})
     return bins(ray.wavelengths, path.sample(built, sampler, ray)[0] * weight)
 
 
