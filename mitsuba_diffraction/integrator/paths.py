@@ -47,6 +47,8 @@ class Gratings:
     def __init__(self, scene: mi.Scene) -> None:
         areas = [(shape, _area(shape)) for shape in scene.shapes() if gratings_in(shape.bsdf())]
         areas = [(shape, area) for shape, area in areas if area > 0]
+        is_found = _are_found(scene, [shape for shape, _ in areas])
+        areas = [one for one, found in zip(areas, is_found, strict=True) if found]
         self.shapes = [shape for shape, _ in areas]
         has_instances = any(shape.class_name() == "Instance" for shape in scene.shapes())
         groups = [shape for shape in parts(scene, mi.Shape) if shape.class_name() == "ShapeGroupPlugin"]
@@ -120,6 +122,28 @@ def _area(shape: mi.Shape) -> float:
     return float(shape.surface_area()[0])
 
 
+def _are_found(scene: mi.Scene, shapes: list[mi.Shape]) -> NDArray[np.bool_]:
+    """Return on which shapes rays find the points that Mitsuba draws there.
+
+    They do not on a sphere with a scale that is not uniform, and on a disk after `rotate` about an axis that is not of
+    unit length, whose inverse in Mitsuba 3.9.1 is that of another transform.
+    """
+    if not shapes:
+        return np.zeros(0, bool)
+    rng = mi.PCG32(size=len(shapes) * _DRAWN_POINTS)
+    point = mi.Point2f(rng.next_float32(), rng.next_float32())
+    index = dr.arange(mi.UInt32, len(shapes) * _DRAWN_POINTS) // _DRAWN_POINTS
+    drawn = dr.switch(index, [shape.sample_position for shape in shapes], mi.Float(0), point, mi.Bool(True))
+    found = scene.ray_test(_ray_to(drawn.p, drawn.n, mi.Float(0), mi.Spectrum(0)))
+    return np.array(found).reshape(len(shapes), -1).mean(1) > _MIN_FOUND
+
+
+def _ray_to(point: mi.Point3f, normal: mi.Normal3f, time: mi.Float, wavelengths: mi.Spectrum) -> mi.Ray3f:
+    """Return a short ray along the normal of a surface that meets it at a point."""
+    offset = mi.math.RayEpsilon * (1 + dr.max(dr.abs(point)))
+    return mi.Ray3f(point + normal * offset, -normal, 2 * offset, time, wavelengths)
+
+
 def _is_grating_only(bsdf: mi.BSDF) -> bool:
     """Return whether a BSDF is a grating without `base`, or a `twosided` of such gratings."""
     components = parts(bsdf, mi.BSDF)
@@ -130,6 +154,7 @@ def _is_grating_only(bsdf: mi.BSDF) -> bool:
 
 _GRATING_PROBABILITY = 0.5  # of a direction to a point on a grating
 _VISIBILITY_TOLERANCE = 1e-3  # relative, of the distance to that point
+_DRAWN_POINTS, _MIN_FOUND = 1024, 0.995  # on a shape, and the fraction of them that rays find
 _DENSITY_TOLERANCE = 1e-3  # relative, of the density of a sample and that of its direction
 
 
@@ -549,10 +574,8 @@ class LightPaths:
             candidate += 1
         power = response * received * (total_weight / (chosen_weight * _NUM_CANDIDATES))
 
-        # A short ray along the normal finds the complete interaction at that point, with tangents and UVs.
-        offset = mi.math.RayEpsilon * (1 + dr.max(dr.abs(point)))
-        ray = mi.Ray3f(point + normal * offset, -normal, 2 * offset, time, wavelengths)
-        si = self.scene.ray_intersect(ray, total_weight > 0)
+        # The complete interaction at that point, with tangents and UVs.
+        si = self.scene.ray_intersect(_ray_to(point, normal, time, wavelengths), total_weight > 0)
         active = si.is_valid()
         si.wi = si.to_local(direction)
         power *= dr.abs(dr.dot(direction, si.n))

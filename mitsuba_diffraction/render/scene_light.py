@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 from ..bsdf.base import is_grating
 from ..bsdf.device_tables import on_device
 from ..bsdf.light import recorded_wavelengths
+from ..integrator.paths import implements
 
 _log = logging.getLogger(__name__)
 
@@ -58,10 +59,13 @@ def _emission(emitter: mi.Emitter, grid: NDArray[np.float64]) -> NDArray[np.floa
     """Return the spectrum of a light on a grid of equidistant wavelengths in nm, (n,), up to a factor.
 
     It is a histogram of wavelengths sampled by the light itself, so that narrow lines are not missed. A light whose
-    spectrum varies over positions or directions is sampled at a single one.
+    spectrum varies over positions or directions is sampled at a single one. It is zero of lights that do not sample
+    wavelengths, as with the texture `checkerboard`.
     """
     si = dr.zeros(mi.SurfaceInteraction3f)
     si.wi = mi.Vector3f(0, 0, -1)
+    if not implements(emitter.sample_wavelengths, si, mi.Float(0.5)):
+        return np.zeros(grid.size)
     numbers = (np.arange(_DRAWS_PER_LIGHT, dtype=np.float32) + 0.5) / _DRAWS_PER_LIGHT
     wavelengths, weights = emitter.sample_wavelengths(si, on_device(numbers))
     wavelengths, weights = (x.ravel() for x in np.broadcast_arrays(wavelengths, mi.unpolarized_spectrum(weights)))

@@ -10,7 +10,7 @@ import pytest
 from bsdf_support import bitmap, grating, uniform, use
 
 import mitsuba_diffraction  # noqa: F401 (settles which LLVM is used before a variant is set)
-from mitsuba_diffraction.integrator.paths import LightPaths, SplatBuffer, _power_heuristic
+from mitsuba_diffraction.integrator.paths import Gratings, LightPaths, SplatBuffer, _power_heuristic
 from mitsuba_diffraction.render import scene_file
 from mitsuba_diffraction.render.scene_file import SceneFile
 from mitsuba_diffraction.render.spectral_film import channel_weights
@@ -333,6 +333,22 @@ def test_buffers_of_later_launches_are_large_enough_at_once(llvm, monkeypatch):
     np.testing.assert_array_equal(found, wanted)
 
 
+@pytest.mark.parametrize(
+    ("kind", "transform", "is_drawn_on"),
+    [
+        ("disk", lambda: at(2000, 1000, 0).rotate([0.8, 0, 0.6], 40), True),
+        ("disk", lambda: mi.ScalarTransform4f(np.eye(4) + 0.3 * np.eye(4, k=1)), True),
+        ("sphere", lambda: at(1, 2, 3).scale(1e-3), True),
+        # Mitsuba takes its transpose for its inverse.
+        ("disk", lambda: mi.ScalarTransform4f().rotate([1, 0, 0.3], 40), False),
+        ("sphere", lambda: mi.ScalarTransform4f().scale([1, 1, 2]), False),
+    ],
+)
+def test_points_are_drawn_on_shapes_only_where_rays_find_them(kind, transform, is_drawn_on, llvm):
+    shape = {"type": kind, "to_world": transform(), "bsdf": blaze()}
+    assert len(Gratings(mi.load_dict({"type": "scene", "shape": shape})).shapes) == is_drawn_on
+
+
 def beam_on_a_grating():
     """All light in the room is cast by the plate."""
     beam = mi.ScalarTransform4f().look_at([0, -2.3, 3.5], [0, 0, 0.4], [0, 1, 0])
@@ -587,6 +603,14 @@ def test_both_halves_draw_the_lines_of_a_lamp(llvm, tmp_path, monkeypatch):
     error = np.std(wanted, 0, ddof=1) / np.sqrt(len(wanted))
     np.testing.assert_array_less(np.abs(found.mean(0) - wanted.mean(0)), 4 * error)
     np.testing.assert_array_less(10 * np.var(found, 0, ddof=1), np.var(wanted, 0, ddof=1))
+
+
+@pytest.mark.slow
+def test_a_light_that_draws_no_wavelengths_is_rendered(llvm, tmp_path):
+    path, colours = tmp_path / "scene.xml", '<texture type="checkerboard" name="radiance"/>'
+    lamp = f'<shape type="rectangle"><emitter type="area">{colours}</emitter></shape></scene>'
+    path.write_text(SCENE.replace("</scene>", lamp))
+    assert np.isfinite(trace_pass(SceneFile(path).load(), 4, 1)).all()
 
 
 @pytest.mark.slow

@@ -3,7 +3,7 @@
 Each is a file of XML, loaded once for `diffraction_path` and once for Mitsuba's integrator. A seed gives the same
 scene. It draws
 
-- one or two gratings: line profiles, crossed ones, skins with a continuum; of metals, dielectrics, with a film, a coat,
+- one or two gratings: line profiles, skins with a continuum; of metals, dielectrics, with a film, a coat,
   a base, transmission as interface or sheet; bare or in `twosided`, `mask`, `blendbsdf`, `normalmap`, `bumpmap`; turned
   by a number or a texture
 - on `rectangle`, `disk`, `sphere`, `cylinder`, `cube`, `ply` (a bent sheet with UVs), `instance`, `bsplinecurve`; some
@@ -49,6 +49,8 @@ def spectra(folder: Path) -> dict[str, Path]:
     files = {}
     for name, (height_field, coherence_length) in surfaces.items():
         files[name] = folder / f"{name}.exr"
+        if files[name].exists():
+            continue
         # Also inside of glass, where wavelengths are shorter.
         settings = {"coherence_length": coherence_length, "tolerance": 0.02, "wavelengths": (230, 830)}
         md.precompute(height_field, **settings).save(files[name])
@@ -57,11 +59,10 @@ def spectra(folder: Path) -> dict[str, Path]:
 
 def plugin(tag, kind, *children, name="", **parameters):
     """A plugin in XML: its children, also in XML, and its parameters, whose types are those in Python."""
-    tags = {bool: "boolean", int: "integer", float: "float"}
-    inner = [
-        f'<{tags.get(type(value), "string")} name="{key}" value="{str(value).lower() if value is True else value}"/>'
-        for key, value in parameters.items()
-    ]
+    tags, inner = {bool: "boolean", int: "integer", float: "float"}, []
+    for key, value in parameters.items():
+        text = str(value).lower() if isinstance(value, bool) else value
+        inner.append(f'<{tags.get(type(value), "string")} name="{key}" value="{text}"/>')
     named = f' name="{name}"' if name else ""
     return f'<{tag} type="{kind}"{named}>{"".join(children)}{"".join(inner)}</{tag}>'
 
@@ -154,11 +155,12 @@ class RandomScene:
         }.get(kind, {"int_ior": 1.5})
         if transmits:
             parameters["transmission"] = kind
+        parameters["conserve_energy"] = False
         children = [self.receiver("base", nested=True, transmits=False)] * (kind == "base")
         if self.chance(0.4):
             children.append(self.number_or_texture("orientation", 0, 180))
         path = self.spectra[self.pick(*self.spectra)]
-        bsdf = plugin("bsdf", "diffraction_grating", *children, filename=path, conserve_energy=False, **parameters)
+        bsdf = plugin("bsdf", "diffraction_grating", *children, filename=path, **parameters)
         return bsdf, transmits
 
     def surface(self):
@@ -170,7 +172,9 @@ class RandomScene:
         if kind == "mask":
             return plugin("bsdf", kind, self.number_or_texture("opacity", 0.3, 0.9), bsdf)
         if kind == "blendbsdf":
-            other = self.receiver(nested=True, transmits=transmits)
+            other = self.receiver(nested=True, transmits=False)
+            if transmits:  # else Mitsuba counts light twice
+                other = plugin("bsdf", "twosided", other)
             return plugin("bsdf", kind, self.number_or_texture("weight", 0.2, 0.8), bsdf, other)
         if kind == "normalmap":
             return plugin("bsdf", kind, self.tilted(), bsdf)

@@ -1,7 +1,7 @@
-"""Random configurations, judged by oracles that share no code with the plugin.
+"""Random configurations, judged by oracles that share no code with the plugin; random scenes, beside Mitsuba.
 
-    python -m pytest tests/soak                                    fixed seeds, half a minute
-    python -m pytest tests/soak --soak 120 --soak-seed 1000        two hours, from a seed on
+    python -m pytest tests/soak                                              fixed seeds, half a minute
+    python -m pytest tests/soak -k scenes --soak 120 --soak-seed 1000        two hours, from a seed on
 
 A failure shows the configuration and its seed; `--soak-seed` without `--soak` finds it again and shrinks it. It
 becomes a case in `CASES`.
@@ -17,6 +17,7 @@ from hypothesis import HealthCheck, Phase, given, settings
 from soak_grammar import Configuration, Surface, configurations
 from soak_model import Cauchy
 from soak_oracles import judge
+from soak_scenes import judge_scene, spectra
 
 pytestmark = [
     pytest.mark.filterwarnings("ignore:pixels of"),
@@ -100,13 +101,36 @@ def test_random_configurations(llvm, tmp_path, pytestconfig, capsys, fixed):
     if not minutes:
         explore(*(FIXED_SEED, fixed) if seed is None else (seed, EXAMPLES), tmp_path)
         return
+    repeat(lambda seed: explore(seed, EXAMPLES, tmp_path, shrink=False), "configurations", minutes, seed, capsys)
+
+
+@pytest.mark.slow
+def test_random_scenes(llvm, tmp_path, pytestconfig, capsys):
+    """Two scenes of fixed seeds, or random ones as the options say."""
+    minutes, seed = pytestconfig.getoption("--soak"), pytestconfig.getoption("--soak-seed")
+    files = spectra(tmp_path)
+    if not minutes:
+        for each in (0, 5) if seed is None else (seed,):
+            judge_scene(each, tmp_path, files)
+        return
+
+    def judged(seed):
+        judge_scene(seed, tmp_path, files)
+        gc.collect()
+        return 1
+
+    repeat(judged, "scenes", minutes, seed, capsys)
+
+
+def repeat(judged, what, minutes, seed, capsys):
+    """Judge for so long, from a seed on; print faults, and at times how many were judged."""
     start = report = time.monotonic()
     seed = time.time_ns() % 10**6 if seed is None else seed
     tried, faults = 0, []
     while time.monotonic() < start + 60 * minutes:
         before = tried
         try:
-            tried += explore(seed, EXAMPLES, tmp_path, shrink=False)
+            tried += judged(seed)
         except Exception as error:
             faults.append(seed)
             with capsys.disabled():
@@ -116,9 +140,9 @@ def test_random_configurations(llvm, tmp_path, pytestconfig, capsys, fixed):
         if time.monotonic() > report + 300 or before == tried:
             report = time.monotonic()
             with capsys.disabled():
-                print(f"\n{elapsed / 60:.0f} min, seed {seed}, {tried} configurations without a fault", flush=True)
+                print(f"\n{elapsed / 60:.0f} min, seed {seed}, {tried} {what} without a fault", flush=True)
     with capsys.disabled():
-        print(f"\n{tried} configurations, {60 * tried / elapsed:.1f} a minute, {len(faults)} faults: {faults}")
+        print(f"\n{tried} {what}, {60 * tried / elapsed:.1f} a minute, {len(faults)} faults: {faults}")
     assert not faults
 
 
