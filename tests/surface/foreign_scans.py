@@ -203,6 +203,47 @@ def ibw(order="<", steps=(DX * 1e-6, DY * 1e-6), units=(b"m", b"m"), layers=0, c
     return head + header.ljust(320, b"\0") + max(layers, 1) * wave.tobytes("F") + note.encode() + names
 
 
+def sxm(direction="down", rows=ROWS, images="both", unit="m"):
+    """Nanonis: the relief forward, and twice its heights backward, after an image of the current."""
+    header = f""":NANONIS_VERSION:
+2
+:SCANIT_TYPE:
+              FLOAT            MSBFIRST
+:SCAN_PIXELS:
+       {COLUMNS}       {ROWS}
+:SCAN_TIME:
+             1.0E-1             1.0E-1
+:SCAN_RANGE:
+           {COLUMNS * DX * 1e-6:E}           {ROWS * DY * 1e-6:E}
+:SCAN_OFFSET:
+             0.000000E+0         0.000000E+0
+:SCAN_DIR:
+{direction}
+:BIAS:
+            2.0E-1
+:ACQ_TIME:
+       10.0
+:COMMENT:
+probe: 5 µm
+
+:DATA_INFO:
+\tChannel\tName\tUnit\tDirection\tCalibration\tOffset
+\t0\tCurrent\tA\tboth\t1.000E-9\t0.000E+0
+\t14\tZ\t{unit}\t{images}\t8.820E-8\t0.000E+0
+
+:SCANIT_END:
+
+
+"""
+    heights = relief() * 1e-6
+    heights[rows:] = np.nan  # not scanned
+    heights = heights[::-1] if direction == "up" else heights
+    stored = {"forward": heights, "backward": 2 * heights[:, ::-1]}
+    chosen = stored.values() if images == "both" else [stored[images]]
+    data = np.stack([np.zeros_like(heights), np.zeros_like(heights), *chosen]).astype(">f4")
+    return header.encode("latin-1") + b"\x1a\x04" + data.tobytes()
+
+
 def h5_jpk(reflect=False, frames=2, multiplier=-1e-13, pixels=ROWS * COLUMNS):
     """JPK in HDF5: matrices of pixels by frames, of which the first has the relief; retrace before trace."""
     import h5py

@@ -7,7 +7,7 @@ from contextlib import nullcontext
 import foreign_scans
 import numpy as np
 import pytest
-from foreign_scans import COLUMNS, DX, DY, REVISION, ROWS, h5_jpk, ibw, jpk, nms, park, sur, tmd, wyko, x3p, zygo
+from foreign_scans import COLUMNS, DX, DY, REVISION, ROWS, h5_jpk, ibw, jpk, nms, park, sur, sxm, tmd, wyko, x3p, zygo
 from test_instrument_files import needs_the_extra
 
 from mitsuba_diffraction.files import reading
@@ -346,6 +346,59 @@ def test_trace_of_jpk_is_read_before_retrace(tmp_path):
     (tmp_path / "scan.jpk").write_bytes(jpk(retrace=True))
     check(tmp_path / "scan.jpk")
     assert read_height_field(tmp_path / "scan.jpk", channel=0).source == "scan.jpk, Height (measured, retrace)"
+
+
+@pytest.mark.parametrize("direction", ["up", "down"])
+@pytest.mark.parametrize("images", ["both", "forward", "backward"])
+@pytest.mark.parametrize("name", ["scan.sxm", "scan"])
+def test_a_scan_of_nanonis_is_read(tmp_path, direction, images, name):
+    path = tmp_path / name
+    path.write_bytes(sxm(direction, images=images))
+    for way, factor in {"forward": 1, "backward": 2}.items():
+        if images in ("both", way):
+            field = read_height_field(path, channel=f"Z ({way})")
+            np.testing.assert_allclose(field.heights, factor * foreign_scans.relief(), rtol=1e-6)
+            assert field.pixel_size == pytest.approx((DX, DY))
+    assert read_height_field(path).source == f"{name}, Z ({'backward' if images == 'backward' else 'forward'})"
+
+
+@pytest.mark.filterwarnings("ignore:.*has non-uft-8 characters")
+@pytest.mark.parametrize("direction", ["up", "down"])
+def test_another_reader_of_nanonis_finds_the_same(tmp_path, direction):
+    read = pytest.importorskip("nanonispy2.read", exc_type=ImportError)
+    path = tmp_path / "scan.sxm"
+    path.write_bytes(sxm(direction))
+    other = read.Scan(str(path))
+    np.testing.assert_allclose(1e6 * other.header["scan_range"], (COLUMNS * DX, ROWS * DY))
+    lines = slice(None, None, -1 if direction == "up" else 1)  # it keeps the order of scanning
+    for way, columns in {"forward": slice(None), "backward": slice(None, None, -1)}.items():
+        heights = read_height_field(path, channel=f"Z ({way})").heights
+        np.testing.assert_array_equal(heights, 1e6 * other.signals["Z"][way][lines, columns].astype(np.float64))
+
+
+def test_a_stopped_scan_of_nanonis_has_missing_pixels(tmp_path):
+    (tmp_path / "scan.sxm").write_bytes(sxm(rows=ROWS // 2))
+    field = read_height_field(tmp_path / "scan.sxm", keep_missing=True)
+    np.testing.assert_array_equal(field.gaps, np.arange(ROWS)[:, None] * np.ones(COLUMNS) >= ROWS // 2)
+
+
+@pytest.mark.parametrize(
+    ("data", "message"),
+    [
+        (sxm()[:-1], "bytes of images, wanted 4 of 24 × 16 pixels"),
+        (sxm()[:200], "not a whole scan of Nanonis"),
+        (sxm()[1:], "not a whole scan of Nanonis"),
+        (sxm(unit="V"), "wanted a channel of heights in a unit of length, got 0 'Current"),
+        (sxm().replace(b"       24       16", b"       24       no"), "SCAN_PIXELS: got '.*no'"),
+        (sxm().replace(b":SCAN_RANGE:", b":SCAN_OTHER:"), "SCAN_RANGE: got 'none'"),
+        (sxm().replace(b"\tboth\t8", b"\tboat\t8"), "DATA_INFO: got '.*boat"),
+    ],
+)
+def test_a_damaged_scan_of_nanonis_is_refused_in_one_line(tmp_path, data, message):
+    (tmp_path / "scan.sxm").write_bytes(data)
+    with pytest.raises(ValueError, match=message) as caught:
+        read_height_field(tmp_path / "scan.sxm")
+    assert "\n" not in str(caught.value)
 
 
 @needs_the_extra

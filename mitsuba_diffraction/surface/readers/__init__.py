@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 from ...errors import RequestError, is_number
 from ...files.reading import check_file
 from ..heightfield import HeightField
-from . import gwyddion, h5_jpk, images, instruments, interferometers, nanoscope, text, workarounds
+from . import gwyddion, h5_jpk, images, instruments, interferometers, nanonis, nanoscope, text, workarounds
 from .scan import (
     MAX_FIELD,
     MAX_HEIGHT_RANGE,
@@ -50,6 +50,7 @@ _WITHOUT_UNIT = {
 _WITH_CHANNELS = {
     ".gwy": gwyddion.read_gwyddion,
     ".h5-jpk": h5_jpk.read_h5_jpk,
+    ".sxm": nanonis.read_nanonis,
     nanoscope.TEXT: nanoscope.read_text,
 }
 # Extension → reader of single-channel formats with a unit.
@@ -75,6 +76,7 @@ _MAGIC = {
     b"MM\0*": ".tif",
     b"ncols ": ".asc",
     b"# File Format = ASCII": ".asc",
+    nanonis.FIRST_LINE: ".sxm",
     b"# Daisy frame view": ".asc",
     b'"\\*File list': nanoscope.TEXT,
     b"DIGITAL SURF": ".sur",
@@ -115,6 +117,7 @@ def read_height_field(
     | .tif | relief that `design` wrote | |
     | .tif, .tiff | Park Systems, with the extra `instruments` | |
     | .gwy, .gsf | Gwyddion, Gwyddion Simple Field | unit, if the file has none |
+    | .sxm | Nanonis | |
     | .xyz | points x y z on a regular grid | unit, if it has none |
     | .asc, .txt | table of heights by Gwyddion, SPIP or Nanoscope Analysis, ESRI grid | unit and pixel_size, if it \
         has none |

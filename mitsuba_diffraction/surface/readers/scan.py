@@ -142,7 +142,7 @@ def choose_channel(channels: Sequence[Channel], wanted: str | int | None) -> Cha
     """
     if wanted is None:
         lengths = [channel for channel in channels if channel.is_length]
-        named = [c for c in lengths if any(name in c.name.lower() for name in _HEIGHT_NAMES)]
+        named = [c for c in lengths if _is_height(c.name.lower())]
         if not lengths:
             lines = ", which are lines, such as a profile" if channels and all(c.is_line for c in channels) else ""
             raise RequestError(f"wanted a channel of heights in a unit of length, got {_listed(channels)}{lines}")
@@ -164,6 +164,10 @@ def choose_channel(channels: Sequence[Channel], wanted: str | int | None) -> Cha
         what = "is a line, such as a profile; wanted heights of an area" if found[0].is_line else "holds no lengths"
         raise RequestError(f"channel: {found[0]} {what}")
     return found[0]
+
+
+def _is_height(name: str) -> bool:
+    return name.partition(" (")[0] == "z" or any(word in name for word in _HEIGHT_NAMES)
 
 
 def _listed(channels: Sequence[Channel]) -> str:
