@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import collections
 import functools
 import gc
 import re
@@ -18,7 +19,9 @@ import pytest
 from bsdf_support import WAVELENGTHS, bitmap, made_up, of_spectrum, random_directions, spectrum, uniform
 
 import mitsuba_diffraction as md
+from mitsuba_diffraction.bsdf.layers import Layers
 from mitsuba_diffraction.bsdf.testing import array, direction, floats, interaction, vectors
+from mitsuba_diffraction.integrator.candidates import Candidates
 from mitsuba_diffraction.integrator.paths import unpacked
 from mitsuba_diffraction.render.scene_file import SceneFile
 from mitsuba_diffraction.render.trace_pass import trace_pass
@@ -62,7 +65,7 @@ def both(bsdf: mi.BSDF, count: int = 256) -> tuple[np.ndarray, ...]:
     return tuple(array(x) for x in (value, density, sampled.wo, sampled.pdf, weight))
 
 
-def scene(bsdf: dict, integrator: str = "path") -> mi.Scene:
+def scene(bsdf: dict, integrator: str = "path", **further: dict) -> mi.Scene:
     """A grating under an even sky and beside a lamp, 8 × 8 pixels."""
     look = mi.ScalarTransform4f().look_at([0, -3, 3], [0, 0, 0], [0, 0, 1])
     lamp = {"type": "sphere", "center": [1, 1, 2], "radius": 0.3}
@@ -79,6 +82,7 @@ def scene(bsdf: dict, integrator: str = "path") -> mi.Scene:
             "sky": {"type": "constant", "radiance": uniform(1.0)},
             "lamp": {**lamp, "emitter": {"type": "area", "radiance": uniform(5.0)}},
             "plate": {"type": "rectangle", "bsdf": {**bsdf, "id": "grating"}},
+            **further,
         }
     )
 
@@ -123,6 +127,33 @@ def test_later_frames_and_loads_have_the_kernels_of_the_first_frame():
     first, *later = [frame for _ in range(3) for frame in frames_of(lambda: mi.load_dict(described), range(2))]
     assert not any(re.search(r"load <?[\w ]*(float|i32).*align 1,", text) for text in first.values())
     assert all(frame.keys() <= first.keys() for frame in later)
+
+
+def test_bodies_of_loops_are_recorded_once(monkeypatch):
+    """Recording is most of the time of a small picture, and was repeated up to eight times where loops are nested."""
+    calls = collections.Counter()
+
+    def count(kind: type, name: str) -> None:
+        method = getattr(kind, name)
+
+        def counted(*args: object) -> object:
+            calls[name] += 1
+            return method(*args)
+
+        monkeypatch.setattr(kind, name, counted)
+
+    bulb = {"type": "point", "position": [1, 0, 3], "intensity": uniform(1.0)}
+    sky = {"type": "constant", "radiance": uniform(1e-4)}
+    built = scene(BLAZE, "diffraction_path", bulb=bulb, sky=sky)
+    sensor = built.sensors()[0]
+    eye, _ = built.integrator().parts(built, sensor)
+    sampler = sensor.sampler()
+    sampler.seed(0, 64)
+    for kind, name in ((Candidates, "sample"), (Candidates, "_kept_of"), (Layers, "sample")):
+        count(kind, name)
+    ray, weight = sensor.sample_ray_differential(0, sampler.next_1d(), sampler.next_2d(), mi.Point2f(0.5))
+    eye.trace(built, sampler, ray, weight)
+    assert calls == {"sample": 3, "_kept_of": 1}
 
 
 @pytest.mark.parametrize("count", [0, 1])

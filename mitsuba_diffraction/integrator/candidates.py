@@ -160,7 +160,10 @@ class Candidates:
         slots, candidates = numbers
         count, total = mi.Float(candidates), mi.Float(slots * candidates)
         slot = mi.UInt32(0)
-        while active & (slot < slots):
+        while dr.hint(
+            active & (slot < slots),
+            exclude=[self, scene, ctx, bsdf, si, number, slots, candidates, count, total, shift, jitter, probability],
+        ):
             pick = sampler.next_1d(active)
             pick = dr.select(sampler.next_1d(active) < self._fraction, mi.UInt32(pick * count), candidates)
             first = (mi.Float(slot * candidates) + jitter) / total
@@ -202,7 +205,7 @@ class Candidates:
         ctx, marks_failure = mi.BSDFContext(), _marks_failure(bsdf)
         omega, guess, sum_of_guesses = mi.Vector3f(0, 0, 1), mi.Float(0), mi.Float(0)
         candidate = mi.UInt32(0)
-        while candidate < candidates:
+        while dr.hint(candidate < candidates, exclude=[self, bsdf, si, ctx, candidates, u, step, shift, pick, active]):
             position = dr.minimum(dr.fma(mi.Float(candidate), step, u), BELOW_ONE)
             bs, _ = bsdf.sample(ctx, si, position, _lattice_point(position / step, shift), active)
             usable = active & ~mi.has_flag(bs.sampled_type, mi.BSDFFlags.Delta)

@@ -55,7 +55,9 @@ class LampsWithoutExtent:
         wavelengths = [mi.Spectrum(0) for _ in range(_PACKETS)]
         values = [mi.Spectrum(0) for _ in range(_PACKETS)]
         packet = mi.UInt32(0)
-        while reached & (packet < _PACKETS):
+        while dr.hint(
+            reached & (packet < _PACKETS), exclude=[self, ctx, bsdf, nowhere, si, ds, point, shift, wo, reached]
+        ):
             # Four wavelengths, each from a quarter of the distribution.
             drawn, weight = self.sensor.sample_wavelengths(nowhere, (mi.Float(packet) + shift) / (4 * _PACKETS))
             other = mi.SurfaceInteraction3f(si)

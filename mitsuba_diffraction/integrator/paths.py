@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Iterable, Iterator
+from contextlib import AbstractContextManager
 
 import drjit as dr
 import mitsuba as mi
@@ -30,6 +31,22 @@ def random_numbers(seed: mi.UInt32 | int, key: int, index: mi.UInt32) -> mi.PCG3
     dr.make_opaque(mixed)
     state, sequence = mi.sample_tea_32(index, mixed)
     return mi.PCG32(initstate=mi.UInt64(state), initseq=mi.UInt64(sequence))
+
+
+def loops_traced_once() -> AbstractContextManager:
+    """Return a context in which Dr.Jit records the body of a loop once.
+
+    By default, it records it again without variables that the body does not change, nested loops four times; recording
+    is most of the time of a small picture. Here loops exclude what they do not change instead.
+    """
+    return dr.scoped_set_flag(dr.JitFlag.OptimizeLoops, False)
+
+
+def widen(si: mi.SurfaceInteraction3f) -> None:
+    """Make all members of an interaction as wide as it is: narrow ones have a loop recorded again."""
+    width = dr.width(si.t)
+    si.time += dr.zeros(mi.Float, width)
+    si.duv_dx, si.duv_dy = dr.zeros(mi.Vector2f, width), dr.zeros(mi.Vector2f, width)
 
 
 class Gratings:
@@ -187,7 +204,8 @@ def define_eye_paths() -> type:
             active: mi.Bool = True,
         ) -> tuple[mi.Spectrum, mi.Bool, list[mi.Float]]:
             # All light at the wavelengths of the ray.
-            ((_, radiance),), valid = self._trace(scene, sampler, ray, mi.Spectrum(1), active, False)
+            with loops_traced_once():
+                ((_, radiance),), valid = self._trace(scene, sampler, ray, mi.Spectrum(1), active, False)
             return radiance, valid, []
 
         def trace(
@@ -197,7 +215,8 @@ def define_eye_paths() -> type:
 
             If there are lamps without extent, a second pair has their light at the first vertex.
             """
-            return self._trace(scene, sampler, ray, weight, True, self.lamps.any)
+            with loops_traced_once():
+                return self._trace(scene, sampler, ray, weight, True, self.lamps.any)
 
         @dr.syntax
         def _trace(
@@ -214,7 +233,7 @@ def define_eye_paths() -> type:
             # Alpha is the same as in `path`: null interactions are transparent, an environment is not.
             valid = mi.Bool(scene.environment() is not None)
             result = self.emitters.at(si).eval(si, active)
-            ray, ray_wavelengths = mi.Ray3f(ray), mi.Spectrum(ray.wavelengths)
+            ray_wavelengths = mi.Spectrum(ray.wavelengths)
             throughput, eta = mi.Spectrum(1.0), mi.Float(1.0)
             depth = mi.UInt32(1)
             active = active & si.is_valid() & (depth < self.max_depth)
@@ -224,8 +243,9 @@ def define_eye_paths() -> type:
             # Whether an earlier vertex is not on a grating; whether the first vertex is on one or scatters specularly;
             # whether an earlier vertex does not.
             has_other_vertex, from_eye_only, has_scattered = mi.Bool(False), mi.Bool(False), mi.Bool(False)
-            while active:
-                bsdf = si.bsdf(ray)
+            widen(si)
+            while dr.hint(active, exclude=[self, scene, ctx]):
+                bsdf = si.bsdf()
                 on_grating, grating_only = self.gratings.classify(si, active)
                 si_bsdf = with_surviving_wavelengths(si, throughput, grating_only)
                 from_light = on_grating & has_other_vertex & (from_eye_only ^ True)
@@ -261,7 +281,7 @@ def define_eye_paths() -> type:
 
                 # BSDF sampling, or the direction to a point on a grating; the next ray may hit an emitter.
                 guided = to_gratings & (sampler.next_1d(active) < _GRATING_PROBABILITY)
-                ps = self.gratings.sample(ray.time, sampler.next_1d(active), sampler.next_2d(active), guided)
+                ps = self.gratings.sample(si.time, sampler.next_1d(active), sampler.next_2d(active), guided)
                 to_point = si.spawn_ray_to(ps.p)
                 distance = dr.norm(ps.p - to_point.o)
                 value, pdf = bsdf.eval_pdf(ctx, si_bsdf, si.to_local(to_point.d), guided)
@@ -282,14 +302,14 @@ def define_eye_paths() -> type:
                 from_eye_only |= (depth == 1) & (delta | on_grating)
                 has_other_vertex |= on_grating ^ True
                 has_scattered |= ~delta
-                ray = si.spawn_ray(dr.select(guided, to_point.d, si.to_world(bs.wo)))
-                next_si = scene.ray_intersect(ray, active)
+                next_ray = si.spawn_ray(dr.select(guided, to_point.d, si.to_world(bs.wo)))
+                next_si = scene.ray_intersect(next_ray, active)
                 ds = self.emitters.towards(scene, next_si, si)
                 pdf_emitter = scene.pdf_emitter_direction(si, ds, active) / probability
                 # Emitters are left to emitter sampling, whose weights ignore points on gratings.
                 on_target, _ = self.gratings.classify(next_si, to_gratings & next_si.is_valid())
                 on_target &= pdf_emitter == 0
-                grating_pdf = dr.select(on_target, self.gratings.pdf_direction(next_si, ray), 0)
+                grating_pdf = dr.select(on_target, self.gratings.pdf_direction(next_si, next_ray), 0)
                 hidden = guided & ~(on_target & (dr.abs(next_si.t - distance) < _VISIBILITY_TOLERANCE * distance))
                 bsdf_pdf = bsdf_probability * dr.select(guided, pdf, bs.pdf)
                 value = dr.select(guided, value, weight * bs.pdf)
@@ -489,7 +509,8 @@ class LightPaths:
             launched = min(_MAX_STARTS_PER_LAUNCH, starts - first)
             while True:
                 buffer = SplatBuffer(math.ceil(self._capacity * launched))
-                self._trace(seed, first, launched, self.pixels / (starts * _BRANCHES), buffer)
+                with loops_traced_once():
+                    self._trace(seed, first, launched, self.pixels / (starts * _BRANCHES), buffer)
                 if buffer.count() <= buffer.capacity:
                     break
                 # Repeated with the same random numbers and a larger buffer, which later launches have at once.
@@ -503,11 +524,12 @@ class LightPaths:
         rng = random_numbers(seed, 0x9E3779B9, start)
         first_si, power, delta, active = self._start(rng)
         power *= dr.opaque(mi.Float, scale)
+        widen(first_si)
         si = mi.SurfaceInteraction3f(first_si)
         branch, depth = mi.UInt32(0), mi.UInt32(1)
         carried, throughput = mi.Spectrum(power), mi.Spectrum(1)
         branches = dr.opaque(mi.UInt32, _BRANCHES)
-        while active:
+        while dr.hint(active, exclude=[self, buffer, start, first_si, power, delta, branches]):
             bsdf = si.bsdf()
             on_grating, grating_only = self.gratings.classify(si, active)
             position, value, connected = self._connect(si, bsdf, _next_2d(rng), active & (on_grating ^ True))
@@ -554,7 +576,7 @@ class LightPaths:
         received, delta = mi.Spectrum(0), mi.Bool(False)
         total_weight, chosen_weight = mi.Float(0), mi.Float(1)
         candidate = mi.UInt32(0)
-        while candidate < _NUM_CANDIDATES:
+        while dr.hint(candidate < _NUM_CANDIDATES, exclude=[self, time, wavelengths]):
             ps = self.gratings.sample(time, _next_1d(rng), _next_2d(rng), True)
             candidate_si = mi.SurfaceInteraction3f(ps, wavelengths)
             candidate_si.time = time

@@ -513,17 +513,19 @@ SCENE = """<scene version="3.0.0">
 </scene>"""
 
 
-def test_any_number_of_light_paths_has_the_same_kernel(llvm, tmp_path):
+def test_any_number_of_light_paths_has_the_same_kernel_of_a_body_recorded_once(llvm, tmp_path, monkeypatch):
     (tmp_path / "scene.xml").write_text(SCENE)
     built = SceneFile(tmp_path / "scene.xml").load()
     _, light = built.integrator().parts(built, built.sensors()[0])
-    hashes = []
+    hashes, recorded, scatter = [], [], light._scatter
+    monkeypatch.setattr(light, "_scatter", lambda *arguments: recorded.append(0) or scatter(*arguments))
     for count in (300, 700):
         dr.kernel_history_clear()
         with dr.scoped_set_flag(dr.JitFlag.KernelHistory, True):
             assert list(light.splats(0, count))
             hashes.append({kernel["hash"] for kernel in dr.kernel_history((dr.KernelType.JIT,))})
     assert hashes[0] == hashes[1]
+    assert len(recorded) == 2
 
 
 @pytest.mark.slow
