@@ -74,8 +74,11 @@ def _with_models(load: Callable[..., mi.Object]) -> Callable[..., mi.Object]:
 
 def _with_light(loaded: mi.Object) -> mi.Object:
     """Return a scene whose gratings cover its light; if they cannot, only this frame has referred to it."""
-    if isinstance(loaded, mi.Scene):
+    if isinstance(loaded, mi.Scene) and classes:
+        from ..render.scene_light import warn_of_missing_boxes
+
         _cover_light(loaded)
+        warn_of_missing_boxes(loaded)
     return loaded
 
 

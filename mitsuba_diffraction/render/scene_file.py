@@ -230,7 +230,10 @@ class SceneFile:
 
 def _config() -> mi.parser.ParserConfig:
     """Return the settings of the parser for the current variant, if there is one."""
-    return mi.parser.ParserConfig(mi.variant() or "scalar_spectral")
+    config = mi.parser.ParserConfig(mi.variant() or "scalar_spectral")
+    # A merged mesh has no bounding box in Mitsuba 3.9.1.
+    config.merge_meshes = False
+    return config
 
 
 def _alternatives(scene: Path, error: str, parameters: Mapping[str, str]) -> str:

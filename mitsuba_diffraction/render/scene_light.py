@@ -98,6 +98,19 @@ def max_plausible_luminance(scene: mi.Scene) -> float:
     return float(brightest) * _MAX_NOISE_FACTOR if brightest > 0 else np.inf
 
 
+def warn_of_missing_boxes(scene: mi.Scene) -> None:
+    """Log a warning if shadow rays to distant lights end early, as a shape has no bounding box.
+
+    Mitsuba 3.9.1 merges shapes of equal BSDFs to a mesh without one, and ends these rays at the sphere around boxes.
+    """
+    is_distant = any(emitter.flags() & +mi.EmitterFlags.Infinite for emitter in scene.emitters())
+    if is_distant and not all(shape.bbox().valid() for shape in scene.shapes()):
+        _log.warning(
+            "Mitsuba merged shapes of equal BSDFs to a mesh without bounding box, past which light of the sky or the "
+            "sun may leak; load the scene with optimize=False"
+        )
+
+
 def warn_of_light_from_below(scene: mi.Scene) -> None:
     """Log a warning for gratings without transmission that are seen or lit only from below, and therefore black."""
     gratings = [shape for shape in scene.shapes() if is_grating(shape.bsdf())]

@@ -194,14 +194,13 @@ def compare_scene(
 
 
 def _reference_scene(scene_file: SceneFile) -> mi.Scene:
-    """Load the scene with the film of `render`, but with independent samples, and without merging meshes."""
+    """Load the scene with the film of `render`, but with independent samples."""
     with scene_file.parsed() as (config, state):
         replace_films(state, *scene_file.size)
         for node in state.nodes:
             if node.type == mi.ObjectType.Sampler:
                 node.props, name = mi.Properties("independent"), node.props.id()
                 node.props.set_id(name)
-        config.merge_meshes = False
         return instantiated(config, state)
 
 
