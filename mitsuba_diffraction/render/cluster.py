@@ -2,19 +2,23 @@
 
 Each band of a pass is a task. A worker loads the scene once per rendering and traces one task at a time with all of its
 threads. Results are added in the order of the passes, so that the sum is identical, bit for bit, to the sum on a single
-machine. At most two tasks per initial worker are in flight. Dask reassigns the tasks of a lost worker.
+machine. At most two tasks per initial worker are in flight. Dask reassigns the tasks of a lost worker; where all are
+lost, others are waited for. A worker with other versions or files is left out.
 """
 
 from __future__ import annotations
 
 import asyncio
 import logging
+import math
 import threading
+import time
 from collections import deque
 from collections.abc import Generator, Iterator
 from concurrent import futures
 from contextlib import contextmanager, suppress
 from functools import lru_cache
+from typing import TYPE_CHECKING
 
 import drjit as dr
 import mitsuba as mi
@@ -25,10 +29,15 @@ from ..errors import RequestError, pip_install
 from .passes import Job, Tracer, trace_band, versions
 from .trace_pass import LightOfBands
 
+if TYPE_CHECKING:
+    import distributed
+
+_log = logging.getLogger(__name__)
 # Held while a pass is traced: it uses all threads of Dr.Jit, and two at a time would only need more memory.
 pass_lock = threading.Lock()
 CONNECT_TIMEOUT = 30  # seconds
 MAX_PASSES_PER_WORKER = 2  # in flight
+SECONDS_WITHOUT_WORKERS, SECONDS_BETWEEN_LOOKS = 30.0, 1.0  # until a warning; at the workers
 
 
 def trace_on(address: str) -> Tracer:
@@ -42,47 +51,110 @@ def trace_on(address: str) -> Tracer:
 
     Raises:
         RuntimeError: if `distributed` is not installed; while rendering, if the scheduler or the workers are
-            unreachable or lost, have other versions or files, or a pass fails, with the cause on one line.
+            unreachable, all workers have other versions or files, or a pass fails, with the cause on one line.
     """
     try:
         import distributed
     except ImportError:
         raise RuntimeError(f"a Dask cluster needs the package distributed: {pip_install('cluster')}") from None
 
-    def trace(job: Job, scene: mi.Scene, first: int) -> Generator[NDArray[np.float32], None, None]:
+    def trace(job: Job, scene: mi.Scene, first: int) -> Generator[NDArray[np.float32] | None, None, None]:
         try:
             distributed.comm.parse_address(address, strict=True)
             asyncio.run(_check_scheduler(address))
             client = distributed.Client(address, timeout=CONNECT_TIMEOUT, set_as_default=False)
         except (OSError, ValueError, TimeoutError, asyncio.TimeoutError) as error:
             raise RuntimeError(f"no Dask scheduler at {address}: {str(error) or 'it does not answer'}") from error
-        with _silent_client_log(), client:
-            waiting: deque[distributed.Future] = deque()
+        with _silent_client_log(), client, _Tasks(client, job, first) as tasks:
             try:
                 client.wait_for_workers(1, timeout=CONNECT_TIMEOUT)
-                max_waiting = MAX_PASSES_PER_WORKER * len(client.nthreads())
-                total = len(job.samples) * len(job.bands)
-                for index in range(first, total):
-                    while len(waiting) < max_waiting and index + len(waiting) < total:
-                        task = client.submit(_trace_on_worker, job, index + len(waiting), pure=False)
-                        waiting.append(task)
-                    traced = waiting[0].result()
-                    waiting.popleft()
-                    yield traced
-                    del traced
             except (distributed.TimeoutError, TimeoutError):
                 raise RuntimeError(f"the Dask scheduler at {address} has no workers") from None
-            except (asyncio.CancelledError, futures.CancelledError, distributed.comm.CommClosedError):
+            try:
+                yield from tasks.results(address)
+            except (asyncio.CancelledError, futures.CancelledError, distributed.TimeoutError, OSError):
                 raise RuntimeError(f"the Dask scheduler at {address} is gone") from None
             except distributed.KilledWorker as error:
                 raise RuntimeError(f"workers of {address} die while tracing: {error}") from None
             except ImportError as error:
                 raise RuntimeError(f"a worker of {address} lacks a package: {error}") from None
-            finally:
-                with suppress(distributed.TimeoutError, TimeoutError, OSError):
-                    client.cancel(list(waiting), force=True)
 
     return trace
+
+
+class _Tasks:
+    """The bands of the passes of a job, as tasks of a cluster; those in flight are cancelled at the end."""
+
+    def __init__(self, client: distributed.Client, job: Job, first: int) -> None:
+        self.client, self.job, self.first = client, job, first
+        self.waiting: deque[distributed.Future] = deque()
+        self.unsuitable: set[str] = set()  # addresses of workers
+        self.thread = futures.ThreadPoolExecutor(1)
+
+    def __enter__(self) -> _Tasks:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        with suppress(TimeoutError, asyncio.TimeoutError, OSError):
+            self.cancel()
+        self.thread.shutdown(wait=False)
+
+    def cancel(self) -> None:
+        self.client.cancel(list(self.waiting), force=True)
+        self.waiting.clear()
+
+    def results(self, address: str) -> Generator[NDArray[np.float32] | None, None, None]:
+        """Yield the results of all tasks in order; while there are no workers, None."""
+        workers, total = self._workers(), len(self.job.samples) * len(self.job.bands)
+        max_waiting, since, result, is_first = MAX_PASSES_PER_WORKER * len(workers), time.monotonic(), None, True
+        while self.first < total:
+            while workers and len(self.waiting) < max_waiting and self.first + len(self.waiting) < total:
+                index, on = self.first + len(self.waiting), sorted(workers) if self.unsuitable else None
+                self.waiting.append(self.client.submit(_trace_on_worker, self.job, index, pure=False, workers=on))
+            # In a thread, as what takes long to arrive must not be requested again.
+            if self.waiting and result is None:
+                result = self.thread.submit(self.waiting[0].result)
+            if result is None or not futures.wait([result], SECONDS_BETWEEN_LOOKS).done:
+                before, workers = workers, self._workers()
+                if workers:
+                    since = time.monotonic()
+                    if self.unsuitable and workers != before:
+                        self.cancel()
+                        result = None
+                    continue
+                if time.monotonic() - since > SECONDS_WITHOUT_WORKERS:
+                    _log.warning("the Dask scheduler at %s has no workers left; waiting for others", address)
+                    since = math.inf
+                if result is None:
+                    time.sleep(SECONDS_BETWEEN_LOOKS)
+                yield None
+                continue
+            since = time.monotonic()
+            try:
+                traced = result.result()
+            except Unsuitable as error:
+                where, reason = error.args
+                self.unsuitable.add(where)
+                workers = self._workers()
+                if is_first and not workers:
+                    raise RuntimeError(reason) from None
+                _log.warning("the worker at %s is left out: %s", where, reason)
+                self.cancel()
+            else:
+                self.waiting.popleft()
+                self.first, is_first = self.first + 1, False
+                yield traced
+                del traced
+            result = None
+
+    def _workers(self) -> set[str]:
+        """Return the addresses of the workers that may suit the job."""
+        threads: dict[str, int] = self.client.sync(self.client.scheduler.ncores, callback_timeout=CONNECT_TIMEOUT)
+        return set(threads) - self.unsuitable
+
+
+class Unsuitable(RuntimeError):
+    """A worker does not suit a job: its address, and why."""
 
 
 @contextmanager
@@ -109,14 +181,18 @@ def _trace_on_worker(job: Job, index: int) -> NDArray[np.float32]:
     """Trace a band of a pass on a worker."""
     import distributed
 
+    worker = distributed.get_worker()
     if versions() != job.versions:
-        raise RuntimeError(f"a worker has {', '.join(versions())}; wanted {', '.join(job.versions)}")
+        raise Unsuitable(worker.address, f"a worker has {', '.join(versions())}; wanted {', '.join(job.versions)}")
     with pass_lock:
         mi.set_variant(job.variant)
-        threads = distributed.get_worker().state.nthreads
-        if dr.thread_count() != threads:
-            dr.set_thread_count(threads)
-        return trace_band(job, scene_of(job), index, light_of(job))
+        if dr.thread_count() != worker.state.nthreads:
+            dr.set_thread_count(worker.state.nthreads)
+        try:
+            scene = scene_of(job)
+        except RuntimeError as error:
+            raise Unsuitable(worker.address, str(error)) from None
+        return trace_band(job, scene, index, light_of(job))
 
 
 @lru_cache(maxsize=1)

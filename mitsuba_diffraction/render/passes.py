@@ -103,8 +103,9 @@ class Job:
         return hash(self.digest())
 
 
-# Yields the results of `trace_band` for `first`, `first` + 1, … in order; see `trace_locally`.
-Tracer = Callable[[Job, "mi.Scene", int], Generator[NDArray[np.float32], None, None]]
+# Yields the results of `trace_band` for `first`, `first` + 1, … in order, or None while nothing is being traced; see
+# `trace_locally`.
+Tracer = Callable[[Job, "mi.Scene", int], Generator["NDArray[np.float32] | None", None, None]]
 
 
 @dataclass(frozen=True)
@@ -151,7 +152,7 @@ def trace_band(job: Job, scene: mi.Scene, index: int, light: LightOfBands) -> ND
     return trace_pass(scene, job.samples[number], pass_seed(job.seed, number), None, job.bands[band], light, job.alpha)
 
 
-def trace_locally(job: Job, scene: mi.Scene, first: int) -> Generator[NDArray[np.float32], None, None]:
+def trace_locally(job: Job, scene: mi.Scene, first: int) -> Generator[NDArray[np.float32] | None, None, None]:
     """Trace the bands of the passes of a job from `first` on in this process; see `trace_band`."""
     light = LightOfBands(job.bands)
     for index in range(first, len(job.samples) * len(job.bands)):
@@ -275,7 +276,10 @@ def _trace(
     with deferred_interrupt() as interrupted, closing(tracer(job, scene, sums.done)) as traced:
         while not (complete or interrupted()):
             with stage("kernels and first pass" if sums.done == first else "rendering"):
-                sums.add(next(traced))
+                if (result := next(traced)) is None:
+                    continue
+                sums.add(result)
+                del result
             before, spent = (now := time.perf_counter()), spent + (now - before if sums.done > first + 1 else 0)
             if sums.done in estimates:
                 remaining = spent / sum(work[first + 1 : sums.done]) * sum(work[sums.done :])

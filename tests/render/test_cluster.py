@@ -1,6 +1,8 @@
 """Passes on a Dask cluster: the bits of one machine, also when a worker is lost."""
 
 import contextlib
+import functools
+import logging
 import os
 import signal
 import socket
@@ -185,6 +187,86 @@ def test_a_port_that_is_silent_is_no_scheduler(command, monkeypatch):
         code, out, err = command(f"render scene.xml --spp 9 --variant llvm_ad_spectral --dask {address}")
     assert (code, out) == (1, "")
     assert err.strip() == f"mitsuba-diffraction: error: no Dask scheduler at {address}: it does not answer"
+
+
+@pytest.fixture
+def invented_passes(monkeypatch):
+    """Passes that are not traced, so that workers may be threads of this process."""
+    monkeypatch.setattr(cluster, "pass_lock", contextlib.nullcontext())
+    monkeypatch.setattr(cluster, "scene_of", functools.cache(lambda job: None))
+    monkeypatch.setattr(cluster, "light_of", lambda job: None)
+    monkeypatch.setattr(cluster, "SECONDS_BETWEEN_LOOKS", 0.05)
+    monkeypatch.setattr(passes, "trace_pass", lambda scene, spp, *_: np.full((SIZE, SIZE, 94), spp, np.float32))
+    dr.set_thread_count(1)
+
+
+def workers_of(address):
+    with distributed.Client(address, set_as_default=False) as client:
+        return set(client.nthreads())
+
+
+def lose_workers(local):
+    local.scale(0)
+    until = time.monotonic() + 10
+    while local.scheduler.workers and time.monotonic() < until:
+        time.sleep(0.01)
+
+
+def test_other_workers_are_waited_for(invented_passes, monkeypatch, caplog):
+    monkeypatch.setattr(cluster, "SECONDS_WITHOUT_WORKERS", 0.2)
+    with start(n_workers=1, processes=False, protocol="tcp") as local:
+
+        def lose(done, total, error):
+            if done == 3:
+                lose_workers(local)
+
+        class Joining(logging.Handler):
+            def emit(self, record):
+                local.scale(1)
+
+        joining = Joining()
+        logging.getLogger(cluster.__name__).addHandler(joining)
+        try:
+            image = render("scene.xml", spp=8, tracer=trace_on(local.scheduler_address), progress=lose)
+        finally:
+            logging.getLogger(cluster.__name__).removeHandler(joining)
+    assert image.attributes["spp"] == 8
+    expected = f"the Dask scheduler at {local.scheduler_address} has no workers left; waiting for others"
+    assert [record.getMessage() for record in caplog.records if record.name == cluster.__name__] == [expected]
+
+
+def test_ctrl_c_is_heard_without_workers(invented_passes, monkeypatch):
+    monkeypatch.setattr(cluster, "SECONDS_WITHOUT_WORKERS", 0.2)
+    monkeypatch.setattr(cluster._log, "warning", lambda *arguments: signal.raise_signal(signal.SIGINT))
+    with start(n_workers=1, processes=False, protocol="tcp") as local, pytest.raises(Interrupted) as caught:
+        render(
+            "scene.xml",
+            spp=8,
+            tracer=trace_on(local.scheduler_address),
+            progress=lambda done, total, error: lose_workers(local) if done == 3 else None,
+        )
+    assert 3 <= caught.value.image.attributes["spp"] < 8
+
+
+def test_a_late_worker_of_another_version_is_left_out(invented_passes, monkeypatch, caplog):
+    with start(n_workers=1, processes=False, protocol="tcp") as local:
+        first, known = workers_of(local.scheduler_address), cluster.versions()
+
+        def versions():
+            return known if distributed.get_worker().address in first else ("mitsuba 2.0",)
+
+        monkeypatch.setattr(cluster, "versions", versions)
+
+        def join(done, total, error):
+            if done == 3:
+                local.scale(2)
+                local.wait_for_workers(2)
+
+        image = render("scene.xml", spp=40, tracer=trace_on(local.scheduler_address), progress=join)
+        (late,) = workers_of(local.scheduler_address) - first
+    assert image.attributes["spp"] == 40
+    messages = {record.getMessage() for record in caplog.records if record.name == cluster.__name__}
+    assert messages == {f"the worker at {late} is left out: a worker has mitsuba 2.0; wanted {', '.join(known)}"}
 
 
 @pytest.mark.slow
