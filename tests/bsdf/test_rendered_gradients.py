@@ -172,3 +172,20 @@ def test_the_derivative_of_a_rendering_is_that_of_differences(relief, name, wrap
     wanted = (number(step) - number(-step)) / (2 * step)
     assert abs(wanted) > 0
     np.testing.assert_allclose(found, wanted, rtol=0.02)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("start", [0.9, 1.1])
+def test_a_search_for_a_period_runs_from_both_sides(start):
+    """Of the surface that a scene computes by itself."""
+    scene = mi.load_dict(md.example_scene("blazed", size=24, period=1.6, depth=0.2))
+    wanted = mi.render(scene, spp=1024, seed=77)
+    parameters, key = mi.traverse(scene), "grating.bsdf.lateral_scale"
+    search = mi.ad.Adam(lr=0.02, params={"scale": mi.Float(start)})
+    for step in range(30):
+        search.set_learning_rate(0.02 if step < 15 else 0.005)
+        parameters[key] = search["scale"]
+        parameters.update()
+        dr.backward(dr.mean(dr.square(mi.render(scene, parameters, spp=64, seed=step) - wanted), axis=None))
+        search.step()
+    assert float(search["scale"][0]) == pytest.approx(1, abs=0.02)
