@@ -39,7 +39,9 @@ class UnshadowedLight:
     """
 
     def __init__(self, scene: mi.Scene) -> None:
-        lamps = [shape for shape in scene.shapes() if shape.is_emitter()]
+        # No ray meets the light of a surface that emits in one direction, `directionalarea`.
+        delta = +mi.EmitterFlags.Delta
+        lamps = [shape for shape in scene.shapes() if shape.is_emitter() and not shape.emitter().flags() & delta]
         radiance = _radiance(scene, lamps)
         environment = scene.environment()
         self.has_extent = bool(lamps) or environment is not None
