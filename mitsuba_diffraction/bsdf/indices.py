@@ -19,6 +19,7 @@ from ..optics.materials import (
     index_of,
     is_dispersive,
     is_file,
+    max_index,
 )
 from ..settings import VISIBLE
 from .base import nested_plugin, parts
@@ -152,10 +153,11 @@ def check_spectra(eta: mi.Texture, k: mi.Texture, *known: KnownRange) -> None:
     fraction = (index + 0.5) / count if shape == (1, 1) else (index * 0.6180339887 + 0.5) % 1
     si.wavelengths = type(si.wavelengths)(on_device(first + (last - first) * fraction))
     size: float | np.ndarray = 0.0
+    limit = max_index(1e-3 * (first + (last - first) * fraction))
     for name, texture in (("eta", eta), ("k", k)):
         values = np.array(dr.detach(texture.eval(si)[0]))
-        if (bad := values[~((values >= 0) & (values <= MAX_INDEX))]).size:
-            raise RequestError(f"{name}: got {bad[0]:g}, wanted 0 to {MAX_INDEX:g}")
+        if (bad := np.flatnonzero(~((values >= 0) & (values <= limit)))).size:
+            raise RequestError(f"{name}: got {values[bad[0]]:g}, wanted 0 to {limit[bad[0]]:g}")
         size = np.hypot(size, values)
     if np.min(size) < MIN_INDEX:
         raise RequestError(f"eta: got an index eta + ik of {np.min(size):g}, wanted {MIN_INDEX:g} to {MAX_INDEX:g}")

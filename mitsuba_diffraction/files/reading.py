@@ -8,6 +8,7 @@ from __future__ import annotations
 import lzma
 import math
 import os
+import struct
 import zipfile
 import zlib
 from collections.abc import Sequence
@@ -18,8 +19,8 @@ from ..errors import RequestError
 from ..progress import bytes_text
 
 MAX_FILE_BYTES = 2**31
-MAX_SMALL_ARRAY_BYTES = 2**27  # in float64, of an array from a file of any size: 4096 × 4096 numbers
-MAX_EXPANSION = 24  # of a file into float64; by 8 if it holds numbers of 8 bits without compression
+MAX_SMALL_ARRAY_BYTES = 2**27  # of an array from a file of any size: 4096 × 4096 numbers in float64
+MAX_EXPANSION = 24  # of a file into an array; numbers of 8 bits without compression expand into float64 by 8
 
 # What zipfile raises of a damaged archive, and where a member is encrypted or compressed in an unknown way.
 BAD_ARCHIVE = (
@@ -33,11 +34,22 @@ BAD_ARCHIVE = (
     RuntimeError,
     ValueError,
 )
+# What Pillow and NumPy raise of damaged files, with warnings as errors, beside OSError.
+BAD_PICTURE = (
+    ArithmeticError,
+    EOFError,
+    LookupError,
+    SyntaxError,
+    TypeError,
+    UserWarning,
+    ValueError,
+    struct.error,
+)
 MAX_ELEMENTS = 2**20  # of an XML file
 MAX_NESTING = 32  # of nested elements
 
 
-def check_file(path: str | os.PathLike[str], max_bytes: int = MAX_FILE_BYTES) -> None:
+def check_file(path: str | os.PathLike[str], max_bytes: float = MAX_FILE_BYTES) -> None:
     """Raise unless a path is an ordinary file of at most `max_bytes`, or a folder, which fails when it is opened.
 
     Raises:
@@ -63,19 +75,21 @@ def read_bytes(path: str | os.PathLike[str], max_bytes: int = MAX_FILE_BYTES) ->
     return Path(path).read_bytes()
 
 
-def check_array(shape: Sequence[int], stored: int) -> None:
+def check_array(shape: Sequence[int], stored: int, item_bytes: int = 8, max_bytes: float = MAX_FILE_BYTES) -> None:
     """Check the shape that a file declares before its array is allocated.
 
     Args:
         shape: numbers along each axis.
         stored: bytes of the file.
+        item_bytes: of a number in memory.
+        max_bytes: of the array, whatever the file.
 
     Raises:
-        RequestError: if one is negative, or float64 would hold more than `MAX_EXPANSION` times the file, and more than
-            `MAX_SMALL_ARRAY_BYTES`.
+        RequestError: if one is negative, or the array has more than `MAX_EXPANSION` times the bytes of the file, and
+            more than `MAX_SMALL_ARRAY_BYTES`.
     """
     count = math.prod(shape)
-    limit = min(max(MAX_SMALL_ARRAY_BYTES, MAX_EXPANSION * stored), MAX_FILE_BYTES) // 8
+    limit = int(min(max(MAX_SMALL_ARRAY_BYTES, MAX_EXPANSION * stored), max_bytes)) // item_bytes
     if count > limit or min(shape, default=0) < 0:
         got = " × ".join(map(str, shape))
         raise RequestError(
@@ -84,17 +98,33 @@ def check_array(shape: Sequence[int], stored: int) -> None:
         )
 
 
-def check_unpacked(unpacked: int, stored: int) -> None:
-    """Check the bytes of the unpacked members of an archive of `stored` bytes before they are unpacked.
+def unpacked_members(archive: zipfile.ZipFile, members: Sequence[str], stored: int) -> dict[str, bytes]:
+    """Return the content of members of an archive of `stored` bytes, as many bytes as it declares.
 
     Raises:
-        RequestError: as `check_array`.
+        RequestError: if they are larger than `check_array` allows, or damaged.
     """
+    try:
+        sizes = {name: archive.getinfo(name).file_size for name in members}
+        check_unpacked(sum(sizes.values()), stored)
+        found = {}
+        for name, size in sizes.items():
+            with archive.open(name) as stream:
+                # Without a size, all that the member really holds would be unpacked.
+                found[name] = stream.read(size)
+        return found
+    except RequestError:
+        raise
+    except BAD_ARCHIVE as error:
+        raise RequestError(f"a damaged archive ({error})") from None
+
+
+def check_unpacked(count: int, stored: int) -> None:
+    """Check the number of bytes that a file of `stored` bytes declares to hold, compressed; errors of `check_array`."""
     limit = min(max(MAX_SMALL_ARRAY_BYTES, MAX_EXPANSION * stored), MAX_FILE_BYTES)
-    if unpacked > limit:
+    if count > limit:
         raise RequestError(
-            f"got an archive of {bytes_text(stored)} that unpacks to {bytes_text(unpacked)}, wanted at most "
-            f"{bytes_text(limit)}"
+            f"got {bytes_text(stored)} that unpack to {bytes_text(count)}, wanted at most {bytes_text(limit)}"
         )
 
 

@@ -15,11 +15,13 @@ from difflib import get_close_matches
 from importlib import metadata
 from numbers import Complex
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from ..errors import RequestError
+from ..files.reading import check_file
 from ..settings import VISIBLE
 
 MIN_INDEX, MAX_INDEX = 0.01, 100.0
@@ -30,6 +32,8 @@ _MAX_NOISE = 5e-3  # of k, by which measured curves fall below 0
 _MAX_SPREAD = 0.05  # of n or k, relative, in rows of one wavelength
 _ROWS = 20_000  # at most, of a formula
 _MIN_LIKENESS = 0.8  # of a wrong name to one that is proposed, from 0 to 1
+MAX_INDEX_BYTES = 2**19  # of a file of an index; pages have 2 to 300 kB
+_MAX_LEVEL = 8  # of nested lists and mappings; pages have four
 FILES = (".spd", ".csv", ".yml")
 _PAGE = "a file, such as a page of refractiveindex.info (.yml)"
 _FAR_INFRARED = 5e4  # nm, where tables begin that have, or seem to have, wavelengths of another unit
@@ -359,9 +363,10 @@ def read_index(path: str | os.PathLike[str]) -> RefractiveIndex:
         RequestError: if it is in another format, its wavelengths have another unit, or n or k are out of range.
     """
     path = Path(path)
-    if not path.is_file():
-        raise FileNotFoundError(f"{path}: no such file")
     of_k = _path_of_k(path)
+    for file in (path, of_k):
+        if file is not None:
+            check_file(file, MAX_INDEX_BYTES)
     return _read(
         path, *(stat for file in (path, of_k) if file for stat in (file.stat().st_mtime_ns, file.stat().st_size))
     )
@@ -386,7 +391,7 @@ def _read(path: Path, *state: int) -> RefractiveIndex:
         start, stop = _possible_rows(wavelengths, n, k)
     except RequestError as error:
         raise RequestError(f"{path}: {error}") from None
-    except (ValueError, KeyError, TypeError, IndexError, AttributeError) as error:
+    except (ValueError, KeyError, TypeError, IndexError, AttributeError, ArithmeticError) as error:
         text = str(error).splitlines()[0] if str(error) else type(error).__name__
         raise RequestError(f"{path}: not a table of refractive indices ({text})") from None
     known = wavelengths[start:stop]
@@ -451,6 +456,12 @@ def _doubts(wavelengths: _Table, of_k: _Table | None) -> tuple[Doubt, ...]:
     return tuple(found)
 
 
+def max_index(wavelengths: ArrayLike) -> NDArray[np.float64]:
+    """Return the largest possible n or k at wavelengths in µm, any shape: in the far infrared metals have more."""
+    micrometres = np.asarray(wavelengths)
+    return np.where((micrometres >= _STRICT[0]) & (micrometres <= _STRICT[1]), MAX_INDEX, _MAX_FAR)
+
+
 def _possible_rows(wavelengths: _Table, n: _Table, k: _Table) -> tuple[int, int]:
     """Return (first, end) of the rows whose n and k can be; those in `_STRICT` all are.
 
@@ -458,7 +469,7 @@ def _possible_rows(wavelengths: _Table, n: _Table, k: _Table) -> tuple[int, int]
         RequestError: if one of these cannot be, or, without one there, any row.
     """
     strict = (wavelengths >= _STRICT[0]) & (wavelengths <= _STRICT[1])
-    limit = np.where(strict, MAX_INDEX, _MAX_FAR)
+    limit = max_index(wavelengths)
     strict |= not strict.any()
     of_both = [("n", n, (n >= MIN_INDEX) & (n <= limit)), ("k", k, (k >= -_MAX_NOISE) & (k <= limit))]
     for what, values, can_be in of_both:
@@ -521,7 +532,7 @@ def _read_yml(path: Path) -> _Tables:
     import yaml
 
     try:
-        data = yaml.safe_load(path.read_text(encoding="utf-8"))["DATA"]
+        data = yaml.load(path.read_text(encoding="utf-8"), _flat_loader())["DATA"]
     except yaml.YAMLError as error:
         raise RequestError(f"not YAML ({str(error).splitlines()[0]})") from None
     of_n = of_k = None
@@ -533,6 +544,8 @@ def _read_yml(path: Path) -> _Tables:
             of_k = table[[0, -1]] if which in ("nk", "k") else of_k
         else:
             first, last = (float(x) for x in str(entry.get("wavelength_range", entry.get("range"))).split())
+            if not 0 < first <= last < np.inf:
+                raise RequestError(f"got a formula from {first:g} to {last:g} µm, wanted the range of wavelengths")
             # As finely as the fastest dispersion that tables of visible light show.
             count = max(2, int((last - first) * 1e3) + 1)
             wavelengths = np.linspace(first, last, count) if count <= _ROWS else np.geomspace(first, last, _ROWS)
@@ -541,6 +554,29 @@ def _read_yml(path: Path) -> _Tables:
     if of_n is None:
         raise RequestError("got no n")
     return of_n, of_k
+
+
+@functools.cache
+def _flat_loader() -> Any:
+    """Return a loader of YAML for texts, lists and mappings of few levels."""
+    import yaml
+
+    class _FlatLoader(yaml.BaseLoader):
+        """Refuses aliases, by which a short text stands for a long one, and deep levels."""
+
+        level = 0
+
+        def compose_node(self, parent: Any, index: Any) -> Any:
+            if self.check_event(yaml.AliasEvent):
+                raise RequestError("got an alias of YAML (*), wanted values")
+            if self.level >= _MAX_LEVEL:
+                raise RequestError(f"got YAML of more than {_MAX_LEVEL} levels")
+            self.level += 1
+            node = super().compose_node(parent, index)
+            self.level -= 1
+            return node
+
+    return _FlatLoader
 
 
 def _formula(number: int, coefficients: tuple[float, ...], wavelength: _Table) -> _Table:

@@ -13,6 +13,7 @@ from ..surface.prepare import step_of
 
 _LISTS = ("pixel_size", "unit", "wavelengths", "prepare")
 """Names that may be repeated, for a list."""
+_MAX_PARTS = 200  # of which any successive ones may be the name of a file
 
 
 def parsed(text: str) -> tuple[str, dict[str, Any]]:
@@ -38,6 +39,8 @@ def parsed(text: str) -> tuple[str, dict[str, Any]]:
 def _split_source(text: str) -> tuple[str, list[str]]:
     """Return the source as it is written, the longest beginning that is a file, and the parts after it."""
     parts = text.split(",")
+    if len(parts) > _MAX_PARTS:
+        raise RequestError(f"{text[:60]}…: got {len(parts)} parts between commas, wanted at most {_MAX_PARTS}")
     end = next((end for end in range(len(parts), 1, -1) if os.path.exists(",".join(parts[:end]))), 1)
     return ",".join(parts[:end]) if end > 1 else parts[0].strip(), parts[end:]
 

@@ -389,10 +389,15 @@ def _check(name: str, argument: object, where: str = "") -> None:
         raise RequestError(f"{where}{name}: got {argument!r}, wanted {wanted}")
 
 
+MAX_STEPS = 32  # of a recipe; each takes seconds of a large scan
+
+
 def check_steps(steps: object) -> list[tuple[str, tuple[object, ...]]]:
     """Check a list of steps, each a name or {name: argument}, and return their names and arguments."""
     if not isinstance(steps, list | tuple):
         raise RequestError(f"prepare: got {steps!r}, wanted a list of steps")
+    if len(steps) > MAX_STEPS:
+        raise RequestError(f"prepare: got {len(steps)} steps, wanted at most {MAX_STEPS}")
     found = []
     for step in steps:
         name, *arguments = next(iter(step.items())) if isinstance(step, Mapping) and len(step) == 1 else [step]

@@ -273,6 +273,15 @@ def test_a_table_that_ends_in_the_far_infrared_is_as_fine_in_visible_light(llvm,
         np.testing.assert_allclose(of_table, of_number, rtol=1e-4)
 
 
+def test_an_index_of_hundreds_in_the_far_infrared_is_that_of_a_material(llvm, tmp_path):
+    # Regression: "eta: got 100.002, wanted 0 to 100", though light has its wavelengths elsewhere.
+    visible, whole = tmp_path / "visible.csv", tmp_path / "whole.csv"
+    visible.write_text("wl,n,k\n0.3,0.4,4\n0.9,1.6,8\n")
+    whole.write_text(visible.read_text() + "20,60,150\n200,300,420\n")
+    of_whole, of_visible = (powers(load(material=str(file)), [0.9], [600.0])[0] for file in (whole, visible))
+    np.testing.assert_allclose(of_whole, of_visible, rtol=1e-4)
+
+
 def test_one_film_given_as_texts_is_one_film(llvm):
     texts = load(int_ior=1.5, thin_film_ior="1.38", thin_film_thickness="0.1", thin_film_scale="2")
     numbers = load(int_ior=1.5, thin_film_ior=1.38, thin_film_thickness=0.1, thin_film_scale=2.0)

@@ -36,6 +36,7 @@ from .scan import (
 
 __all__ = ["read_height_field"]
 
+_MAX_TITLE = 200  # characters of the name of a channel
 _MAX_QUOTE = 500  # characters of a library's error message, as some quote a damaged header in full
 _WITHOUT_UNIT = {
     ".npy": images.read_npy,
@@ -176,7 +177,7 @@ def read_height_field(
         pixel_size = scan.pixel_size if pixel_size is None else pixel_size
         if pixel_size is None:
             raise RequestError(f"pixel_size: the file has none, wanted one number or (x, y) in µm{hint}")
-        source = f"{path.name}, {scan.channel}" if scan.channel else path.name
+        source = f"{path.name}, {scan.channel[:_MAX_TITLE]}" if scan.channel else path.name
         field = HeightField(heights, pixel_size, source, fill_missing=fill_missing, keep_missing=keep_missing)
         _check_scale(field, not keep_missing, _RANGE if integers else _UNITS)
         if is_given:

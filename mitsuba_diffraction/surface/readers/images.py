@@ -18,9 +18,9 @@ from PIL import Image, UnidentifiedImageError
 
 from ...errors import RequestError
 from ...files.outputs import MARK
-from ...files.reading import BAD_ARCHIVE, check_array
+from ...files.reading import BAD_ARCHIVE, BAD_PICTURE, check_array
 from . import scan
-from .scan import DAMAGED, Scan
+from .scan import Scan
 
 
 def read_npy(path: Path) -> Scan:
@@ -75,7 +75,7 @@ def _load_array(file: IO[bytes], size: int, stored: int) -> NDArray:
             return np.lib.format.read_array(file, allow_pickle=False)
     except RequestError:
         raise
-    except (*DAMAGED, ValueError, MemoryError, tokenize.TokenError) as error:
+    except (*BAD_PICTURE, MemoryError, tokenize.TokenError) as error:
         raise RequestError(f"not an array that can be read ({error})") from None
 
 
@@ -87,7 +87,7 @@ MAX_ANNOTATION_FRACTION = 0.25  # of pixels that are coloured, such as a scale b
 
 def private_tag(path: Path, tags: Iterable[int]) -> int | None:
     """Return which of these tags a TIFF has, None if it has none of them."""
-    with warnings.catch_warnings(), suppress(*DAMAGED, ValueError, OSError, Image.DecompressionBombError):
+    with warnings.catch_warnings(), suppress(*BAD_PICTURE, OSError, Image.DecompressionBombError):
         warnings.simplefilter("ignore")  # `read_image` refuses what is too large
         with Image.open(path, formats=("TIFF",)) as picture:
             return next((tag for tag in tags if tag in picture.tag_v2), None)
@@ -102,10 +102,10 @@ def read_image(path: Path) -> Scan:
         warnings.simplefilter("error", UserWarning)
         try:
             with Image.open(path, formats=("PNG", "TIFF")) as picture:
+                check_array(picture.size, path.stat().st_size)
                 pages = getattr(picture, "n_frames", 1)
                 if pages != 1:
                     raise RequestError(f"got {pages} pages or frames, wanted one")
-                check_array(picture.size, path.stat().st_size)
                 pixel_size, doubt = _pixel_size(picture)
                 return Scan(_numbers_of(picture), pixel_size, doubt=doubt, height_range=_own_height_range(picture))
         except UnidentifiedImageError:
@@ -117,7 +117,7 @@ def read_image(path: Path) -> Scan:
             ) from None
         except RequestError:
             raise
-        except (*DAMAGED, ValueError) as error:
+        except BAD_PICTURE as error:
             raise RequestError(f"a damaged picture ({type(error).__name__}: {error})") from None
 
 

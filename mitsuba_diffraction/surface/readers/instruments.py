@@ -8,7 +8,6 @@ from __future__ import annotations
 import logging
 import re
 import warnings
-import zipfile
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -17,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ...errors import RequestError, pip_install
-from ...files.reading import BAD_ARCHIVE, check_array, check_unpacked
+from ...files.reading import check_array
 from . import scan, workarounds
 from .scan import Channel, Scan, choose_channel
 
@@ -59,8 +58,6 @@ def read_instrument(path: Path, unit: str | tuple[str, str] | None, channel: str
         except ImportError as error:
             raise RequestError(f"an instrument's own format: wanted SurfaceTopography, {EXTRA} ({error})") from None
         name = format_of(extension) or ""
-        if name != "jpk":  # of whose archives one member is read
-            _refuse_bomb(path)
         library = lookup_reader_by_format[name]
         contents, doubts, has_unit_of_heights = workarounds.rewritten(path, name)
         try:
@@ -115,14 +112,3 @@ def _quiet() -> Iterator[None]:
         yield
     finally:
         logging.disable(before)
-
-
-def _refuse_bomb(path: Path) -> None:
-    """Raise RequestError for archives that the library would unpack to too much memory."""
-    if zipfile.is_zipfile(path):
-        try:
-            with zipfile.ZipFile(path) as archive:
-                unpacked = sum(member.file_size for member in archive.infolist())
-        except BAD_ARCHIVE as error:
-            raise RequestError(f"a damaged archive ({error})") from None
-        check_unpacked(unpacked, path.stat().st_size)

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import codecs
-import struct
 from collections.abc import Sequence
 from dataclasses import dataclass
 
@@ -92,8 +91,6 @@ def decoded(content: bytes) -> str:
         return content.decode("latin-1")
 
 
-# Raised by Pillow and NumPy for damaged files, in addition to OSError and ValueError.
-DAMAGED = (SyntaxError, TypeError, KeyError, EOFError, IndexError, OverflowError, struct.error, UserWarning)
 # Names of the height channel in instrument files.
 _HEIGHT_NAMES = ("height", "topograph", "z-axis", "zsensor", "z sensor")
 _RETRACE = ("retrace", "backward")  # in the name of a channel whose lines were scanned on the way back

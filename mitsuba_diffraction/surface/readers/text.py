@@ -55,10 +55,10 @@ _MAX_GRID_DEVIATION = 0.1  # of a coordinate, in pixels, owing to rounding in te
 _MIN_POINT_FRACTION = 0.25  # of grid positions that have a point
 _GWYDDION = "Channel", "Width", "Height", "Value units"
 _SPIP_LINE = re.compile(r"#\s*([\w-]+)\s*[=:](.*)")
-_HEADER_LINE = re.compile(r"#\s*([^:\uff1a#]+?)\s*[:\uff1a](.*)")
+_HEADER_LINE = re.compile(r"#([^:\uff1a#]+)[:\uff1a](.*)")
 _LENGTH = re.compile(r"([-+.,\deE]*)(.*)")
 _BETWEEN_NAMES = re.compile(r"[;,\t]|(?<=[\])])\s+")
-BRACKETS = re.compile(r"[\[(]([^\])]*)[\])]\s*$")
+BRACKETS = re.compile(r"[\[(]([^\[(\])]*)[\])]\s*$")
 _NUMBER = re.compile(r"[-+.]*\d|[-+]?(nan|inf(inity)?)\b", re.IGNORECASE)
 _EMPTY_CELL = re.compile(r"^ *\t|\t *(?:\t|$)", re.MULTILINE)  # between tabs
 _DECIMAL_COMMA = re.compile(r"[-+]?\d+,\d+(?:[eE][-+]?\d+)?")
@@ -175,7 +175,8 @@ def _gwyddion_header(text: str) -> dict[str, str]:
 
 def _header_lines(text: str) -> list[tuple[str, str]]:
     """Return name and value of each comment "# name: value"."""
-    return [(match[1], match[2].strip()) for line in text.splitlines() if (match := _HEADER_LINE.match(line))]
+    found = (match for line in text.splitlines() if (match := _HEADER_LINE.match(line)))
+    return [(match[1].strip(), match[2].strip()) for match in found if match[1].strip()]
 
 
 def _spip(header: dict[str, str], table: NDArray[np.float64], unit: str | tuple[str, str] | None) -> Scan:

@@ -23,7 +23,7 @@ import posixpath
 import struct
 import zipfile
 import zlib
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -33,7 +33,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ...errors import RequestError
-from ...files.reading import BAD_ARCHIVE, check_unpacked, parse_xml, read_bytes
+from ...files.reading import BAD_ARCHIVE, check_unpacked, parse_xml, read_bytes, unpacked_members
 from . import nanoscope, scan
 
 _TMD_COMMENT = 24  # bytes, of the only comment that the library reads
@@ -71,7 +71,7 @@ def rewritten(path: Path, name: str) -> Rewritten:
     if name == "jpk" and zipfile.is_zipfile(path):
         return Rewritten(io.BytesIO(_jpk_image(path)))
     if name not in (*_REWRITE, "di"):
-        return Rewritten(str(path))
+        return Rewritten(_archive(path) if zipfile.is_zipfile(path) else str(path))
     data = read_bytes(path)
     if name == "di":
         data, doubts = nanoscope.rewritten_nanoscope(data)
@@ -87,21 +87,37 @@ def is_jpk(path: Path) -> bool:
     return False
 
 
-def _jpk_image(path: Path) -> bytes:
+def _archive(path: Path) -> io.BytesIO:
+    """Return an archive whose members are as long as they are declared."""
     try:
-        with zipfile.ZipFile(path) as archive:
-            image = next((member for member in archive.infolist() if member.filename in _JPK_IMAGES), None)
-            if image is None:
-                raise RequestError(
-                    f"an archive without an image of the heights ({' or '.join(_JPK_IMAGES)}): save that image with "
-                    "JPK's program, as .jpk or .jpk-qi-image"
-                )
-            check_unpacked(image.file_size, path.stat().st_size)
-            return archive.read(image)
-    except RequestError:
-        raise
+        archive = zipfile.ZipFile(path)
     except BAD_ARCHIVE as error:
         raise RequestError(f"a damaged archive ({error})") from None
+    with archive:
+        return _packed(unpacked_members(archive, archive.namelist(), path.stat().st_size))
+
+
+def _packed(members: Mapping[str, bytes]) -> io.BytesIO:
+    """Return an archive, without compression."""
+    whole = io.BytesIO()
+    with zipfile.ZipFile(whole, "w") as written:
+        for name, content in members.items():
+            written.writestr(name, content)
+    return whole
+
+
+def _jpk_image(path: Path) -> bytes:
+    try:
+        archive = zipfile.ZipFile(path)
+    except BAD_ARCHIVE as error:
+        raise RequestError(f"a damaged archive ({error})") from None
+    with archive:
+        if (image := next((name for name in archive.namelist() if name in _JPK_IMAGES), None)) is None:
+            raise RequestError(
+                f"an archive without an image of the heights ({' or '.join(_JPK_IMAGES)}): save that image with "
+                "JPK's program, as .jpk or .jpk-qi-image"
+            )
+        return unpacked_members(archive, [image], path.stat().st_size)[image]
 
 
 def _tmd(data: bytes) -> bytes:
@@ -159,7 +175,7 @@ def _x3p(data: bytes) -> bytes:
         if not mains:
             raise RequestError("not an X3P file, which is an archive that contains main.xml")
         main = min(mains, key=len)
-        root = parse_xml(archive.read(main))
+        root = parse_xml(unpacked_members(archive, [main], len(data))[main])
     except RequestError:
         raise
     except (*BAD_ARCHIVE, ElementTree.ParseError) as error:
@@ -189,12 +205,8 @@ def _x3p(data: bytes) -> bytes:
     for link in root.findall("Record3/DataLink/*"):
         name = (link.text or "").strip().replace("\\", "/").removeprefix("./").strip("/")
         if name in inside:
-            link.text, members[name] = name, archive.read(inside[name])
-    whole = io.BytesIO()
-    with zipfile.ZipFile(whole, "w") as written:
-        for name, content in {"main.xml": ElementTree.tostring(root), **members}.items():
-            written.writestr(name, content)
-    return whole.getvalue()
+            link.text, members[name] = name, unpacked_members(archive, [inside[name]], len(data))[inside[name]]
+    return _packed({"main.xml": ElementTree.tostring(root), **members}).getvalue()
 
 
 def _ibw(data: bytes) -> bytes:

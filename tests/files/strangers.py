@@ -1,0 +1,592 @@
+"""Files from strangers, and mutants of good ones: each is read, or refused in one line, within 10 s and 1 GB of memory.
+
+As a program, in a process of its own: `python strangers.py NAME…` of crafted files, `python strangers.py FORMAT:COUNT…`
+for so many mutants. It prints a line for each fault.
+"""
+
+import functools
+import io
+import random
+import re
+import struct
+import sys
+import time
+import warnings
+import zipfile
+import zlib
+from contextlib import suppress
+from pathlib import Path
+from tempfile import TemporaryDirectory
+
+import numpy as np
+
+sys.path.insert(0, str(Path(__file__).parents[1] / "surface"))
+
+import foreign_scans
+import Imath
+import OpenEXR
+from PIL import Image
+
+from mitsuba_diffraction.errors import is_bug
+from mitsuba_diffraction.files.picture_file import read_picture
+from mitsuba_diffraction.files.writing import UNSEALED, seal
+from mitsuba_diffraction.optics.materials import read_index
+from mitsuba_diffraction.precomputation.recipe import Recipe
+from mitsuba_diffraction.precomputation.requested_surface import RequestedSurface
+from mitsuba_diffraction.precomputation.spectra import load_spectrum, precompute
+from mitsuba_diffraction.surface.gratings import PROFILES
+from mitsuba_diffraction.surface.heightfield import HeightField
+from mitsuba_diffraction.surface.readers import read_height_field
+
+MAX_SECONDS, MAX_BYTES = 10, 10**9
+RELIEF = foreign_scans.relief()
+
+# ---------------------------------------------------------------- originals
+
+
+def _saved(write):
+    """The bytes of a file written by `write(stream)`."""
+    stream = io.BytesIO()
+    write(stream)
+    return stream.getvalue()
+
+
+def _of_file(suffix, write):
+    """The bytes of a file written by `write(path)`."""
+    with TemporaryDirectory() as folder:
+        path = Path(folder) / f"original{suffix}"
+        write(path)
+        return path.read_bytes()
+
+
+def _gwy():
+    import gwyfile
+
+    def write(path):
+        field = gwyfile.objects.GwyDataField(RELIEF * 1e-6, xreal=6e-6, yreal=6e-6, si_unit_xy="m", si_unit_z="m")
+        container = gwyfile.objects.GwyContainer()
+        container["/0/data/title"], container["/0/data"] = "Height", field
+        container.tofile(str(path))
+
+    return _of_file(".gwy", write)
+
+
+def _gsf():
+    head = b"Gwyddion Simple Field 1.0\nXRes = 24\nYRes = 16\nXReal = 6e-6\nYReal = 6e-6\nXYUnits = m\nZUnits = m\n"
+    return head + bytes(4 - len(head) % 4) + (RELIEF * 1e-6).astype("<f4").tobytes()
+
+
+def _points():
+    lines = [f"{0.25 * x:.3f} {0.4 * y:.3f} {RELIEF[y, x]:.4f}" for y, x in np.ndindex(RELIEF.shape)]
+    return "\n".join(lines).encode()
+
+
+def _table(separator=" "):
+    return "\n".join(separator.join(f"{h:.4f}" for h in row) for row in RELIEF).encode()
+
+
+def _esri():
+    return b"ncols 24\nnrows 16\nxllcorner 0\nyllcorner 0\ncellsize 0.25\nNODATA_value -9999\n" + _table()
+
+
+def _spip():
+    head = (
+        "# File Format = ASCII\n# x-pixels = 24\n# y-pixels = 16\n# x-length = 6000\n# y-length = 6000\n# z-unit = um\n"
+    )
+    return head.encode() + _table()
+
+
+def _nanoscope():
+    settings = {"Scan Size": "6000 nm", "Samps/line": 24, "Lines": 16, "Aspect Ratio": "1:1"}
+    return foreign_scans.nanoscope(RELIEF, settings, {"Aspect Ratio": "1:1", "Scan Size": "6 6 ~m"})
+
+
+def _nanoscope_text():
+    header = """\\*File list
+\\Version: 0x09400000
+\\*Ciao scan list
+\\Scan Size: 6 ~m
+\\Samps/line: 24
+\\Lines: 16
+\\*Ciao image list
+\\Data offset: 81920
+\\Data length: 1536
+\\Samps/line: 24
+\\Number of lines: 16
+\\Scan Size: 6 6.4 ~m
+\\*File list end
+Height_Sensor(um)
+"""
+    return header.encode() + "\n".join(f"{h:.4f}" for h in RELIEF.ravel()).encode()
+
+
+def _picture(kind, mode="L", **options):
+    grey = np.uint8(255 * RELIEF)
+    image = {
+        "L": Image.fromarray(grey),
+        "I;16": Image.fromarray(np.uint16(65535 * RELIEF)),
+        "F": Image.fromarray(RELIEF.astype(np.float32)),
+        "RGB": Image.fromarray(np.stack([grey, grey // 2, 255 - grey], -1)),
+        "RGBA": Image.fromarray(np.stack([grey, grey // 2, 255 - grey, grey], -1)),
+        "P": Image.fromarray(grey).convert("P"),
+    }[mode]
+    return _saved(lambda stream: image.save(stream, kind, **options))
+
+
+@functools.cache
+def _spectrum(surface="relief", **settings):
+    surfaces = {
+        "relief": HeightField(RELIEF * 0.2, (0.25, 0.4), "relief"),
+        "rough": HeightField(np.random.default_rng(0).normal(0, 0.02, (48, 64)), 0.15, "noise"),
+        "line": PROFILES["sinusoidal"](period=1.0, depth=0.05),
+    }
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")  # of coarse pixels
+        return _of_file(".exr", precompute(surfaces[surface], **settings).save)
+
+
+def _spectral_image():
+    from mitsuba_diffraction.render.spectral_image import SpectralImage
+
+    image = SpectralImage(np.array([450.0, 550.0, 650.0]), np.full((4, 6, 3), 0.5, np.float32), {"digest": "a"})
+    return _of_file(".exr", image.save)
+
+
+def _read_spectral_image(path):
+    from mitsuba_diffraction.render.spectral_image import SpectralImage
+
+    SpectralImage.load(path)
+
+
+def _surface(path):
+    RequestedSurface.of(path.read_bytes().decode("utf-8", "surrogateescape")).recipe.check()
+
+
+def _scan(**options):
+    return lambda path: read_height_field(path, fill_missing=True, **options)
+
+
+_GREY = _scan(pixel_size=0.1, height_range=0.5)
+_MICROMETRES = _scan(pixel_size=0.1, unit="um")
+_INSTRUMENT = _scan()
+_PAGE = b"REFERENCES: none\nDATA:\n  - type: tabulated nk\n    data: |\n        0.3 1.5 0.1\n        0.9 1.6 0.2\n"
+_FORMULA = (
+    b"DATA:\n  - type: formula 2\n    wavelength_range: 0.3 2.5\n    coefficients: 0 1.04 0.006 0.23 0.02 1.01 103\n"
+)
+_PROFILE = b'[surface]\nprofile = "blazed"\nperiod = 2.5\ndepth = 0.25\n\n[spectrum]\nwavelengths = [360.0, 830.0]\n'
+_OF_SCAN = (
+    b'[surface]\nscan = "scan.npy"\npixel_size = [0.1, 0.2]\nprepare = ["level_plane", { despike = 5.0 }]\n\n'
+    b'[spectrum]\nextent = "tile"\ntolerance = 0.01\n'
+)
+_RIGOROUS = (
+    b'[surface]\nprofile = "sinusoidal"\nperiod = 1.0\ndepth = 0.1\n[spectrum]\ntheory = "rigorous"\nmaterial = "Al"\n'
+)
+
+# Name → how a file of its suffix is made, and read.
+FORMATS = {
+    "npy": (".npy", lambda: _saved(lambda stream: np.save(stream, RELIEF)), _MICROMETRES),
+    "npy_integers": (".npy", lambda: _saved(lambda stream: np.save(stream, np.uint8(255 * RELIEF))), _GREY),
+    "npz": (".npz", lambda: _saved(lambda s: np.savez_compressed(s, heights=RELIEF, pixel_size=0.1)), _scan()),
+    "gwy": (".gwy", _gwy, _scan()),
+    "gsf": (".gsf", _gsf, _scan()),
+    "xyz": (".xyz", _points, _scan(unit="um")),
+    "csv": (".csv", lambda: _table(","), _MICROMETRES),
+    "csv_points": (".csv", lambda: b"x [um],y [um],z [um]\n" + _points().replace(b" ", b","), _scan()),
+    "asc": (".asc", lambda: foreign_scans.gwyddion_text().encode(), _scan()),
+    "esri": (".asc", _esri, _scan(unit="um")),
+    "spip": (".asc", _spip, _scan()),
+    "wyko": (".asc", foreign_scans.wyko, _scan()),
+    "zygo": (".xyz", foreign_scans.zygo, _scan()),
+    "nanoscope_text": (".txt", _nanoscope_text, _scan()),
+    "png": (".png", lambda: _picture("PNG"), _GREY),
+    "png_16": (".png", lambda: _picture("PNG", "I;16"), _GREY),
+    "png_grey_in_colour": (
+        ".png",
+        lambda: _saved(lambda s: Image.new("RGB", (24, 16), (9, 9, 9)).save(s, "PNG")),
+        _GREY,
+    ),
+    "tiff": (".tif", lambda: _picture("TIFF"), _GREY),
+    "tiff_16": (".tif", lambda: _picture("TIFF", "I;16"), _GREY),
+    "tiff_float": (".tif", lambda: _picture("TIFF", "F"), _MICROMETRES),
+    "tiff_compressed": (".tif", lambda: _picture("TIFF", compression="tiff_lzw"), _GREY),
+    "x3p": (".x3p", lambda: foreign_scans.x3p(as_text=False), _INSTRUMENT),
+    "x3p_text": (".x3p", foreign_scans.x3p, _INSTRUMENT),
+    "sur": (".sur", foreign_scans.sur, _INSTRUMENT),
+    "tmd": (".tmd", lambda: foreign_scans.tmd(b"comment"), _INSTRUMENT),
+    "nms": (".nms", foreign_scans.nms, _INSTRUMENT),
+    "ibw": (".ibw", foreign_scans.ibw, _INSTRUMENT),
+    "jpk": (".jpk", foreign_scans.jpk, _INSTRUMENT),
+    "jpk_archive": (".jpk-qi-data", lambda: foreign_scans.jpk(image="data-image.jpk-qi-image"), _INSTRUMENT),
+    "park": (".tiff", foreign_scans.park, _INSTRUMENT),
+    "nanoscope": (".spm", _nanoscope, _INSTRUMENT),
+    "recipe": (".toml", lambda: _PROFILE, lambda path: Recipe.load(path).check()),
+    "recipe_of_scan": (".toml", lambda: _OF_SCAN, lambda path: Recipe.load(path).check()),
+    "recipe_rigorous": (".toml", lambda: _RIGOROUS, lambda path: Recipe.load(path).check()),
+    "index_page": (".yml", lambda: _PAGE, read_index),
+    "index_formula": (".yml", lambda: _FORMULA, read_index),
+    "index_csv": (".csv", lambda: b"wl,n\n0.3,1.5\n0.6,1.55\n0.9,1.6\nwl,k\n0.3,0.1\n0.9,0.2\n", read_index),
+    "index_spd": (".spd", lambda: b"# nm n k\n300 1.5 0.1\n600 1.55 0.15\n900 1.6 0.2\n", read_index),
+    "picture_png": (".png", lambda: _picture("PNG", "RGBA"), read_picture),
+    "picture_palette": (".png", lambda: _picture("PNG", "P", transparency=3), read_picture),
+    "picture_jpeg": (".jpg", lambda: _picture("JPEG", "RGB"), read_picture),
+    "picture_tiff": (".tif", lambda: _picture("TIFF", "I;16"), read_picture),
+    "picture_webp": (".webp", lambda: _picture("WEBP", "RGB"), read_picture),
+    "picture_gif": (".gif", lambda: _picture("GIF", "P"), read_picture),
+    "picture_bmp": (".bmp", lambda: _picture("BMP", "RGB"), read_picture),
+    "picture_ppm": (".ppm", lambda: _picture("PPM", "RGB"), read_picture),
+    "spectrum_of_tile": (".exr", lambda: _spectrum(tolerance=0.5, wavelengths=(780, 830)), load_spectrum),
+    "spectrum_of_sample": (
+        ".exr",
+        lambda: _spectrum("rough", extent="sample", coherence_length=1.5, tolerance=0.1),
+        load_spectrum,
+    ),
+    "spectrum_as_series": (
+        ".exr",
+        lambda: _spectrum(surface="line", representation="taylor", tolerance=0.1),
+        load_spectrum,
+    ),
+    "spectrum_rigorous": (
+        ".exr",
+        lambda: _spectrum("line", theory="rigorous", material="Al", tolerance=0.5),
+        load_spectrum,
+    ),
+    "spectral_image": (".exr", _spectral_image, _read_spectral_image),
+    "surface_text": (
+        ".txt",
+        lambda: b"blazed,period=2.5,depth=0.25,tolerance=0.01,wavelengths=400,wavelengths=700",
+        _surface,
+    ),
+}
+
+# ---------------------------------------------------------------- mutants
+
+_NUMBER = re.compile(rb"[-+]?\d+\.?\d*(?:[eE][-+]?\d+)?")
+_TEXTS = b"inf", b"-1", b"1e30", b"nan", b"0", b"text", b"", b"99999999999", b"1e400", b"-1e-30", b"[[1]]", b"\0"
+_VALUES = np.inf, np.nan, -1, 1e30, 0, 2**31 - 1, -(2**31), 2**15, 10**6, 10**12
+
+
+def mutant(content, random_):
+    """A copy with a few changes: of bits, of the length, or of numbers."""
+    inside = _inside(content)
+    if inside is not None and random_.random() < 0.7:
+        return inside(lambda part: _changed(part, random_), random_)
+    return _changed(content, random_)
+
+
+def _changed(content, random_):
+    data = bytearray(content)
+    for _ in range(random_.choice((1, 1, 1, 2, 4))):
+        at = random_.randrange(len(data) + 1)
+        kind = random_.choice(("bits", "length", "text", "text", "binary"))
+        numbers = list(_NUMBER.finditer(data)) if kind == "text" else []
+        if kind == "bits" and at < len(data):
+            data[at] ^= 1 << random_.randrange(8)
+        elif kind == "length":
+            end = min(len(data), at + random_.choice((1, 4, 100, len(data))))
+            data[at:end] = random_.choice((b"", bytes(data[at:end]) * 2, bytes(random_.choice((1, 50)))))
+        elif numbers:
+            found = random_.choice(numbers)
+            data[found.start() : found.end()] = random_.choice(_TEXTS)
+        else:
+            packed = _packed(random_)
+            at = random_.choice((at, at // 4 * 4, at % 64))
+            data[at : at + len(packed)] = packed
+    return bytes(data)
+
+
+def _packed(random_):
+    value = random_.choice(_VALUES)
+    order = random_.choice("<>")
+    if random_.random() < 0.5:
+        with np.errstate(over="ignore"):
+            return np.array(value, order + random_.choice(("f4", "f8"))).tobytes()
+    whole = int(value) if np.isfinite(value) else -1
+    size = random_.choice((2, 4, 8))
+    return (whole % 256**size).to_bytes(size, "little" if order == "<" else "big")
+
+
+def _inside(content):
+    """A function that changes what checksums or compression hide, if there are any."""
+    if content.startswith(b"PK"):
+        return lambda change, random_: _in_archive(content, change, random_)
+    if content.startswith(b"\x89PNG"):
+        return lambda change, random_: _in_png(content, change, random_)
+    if content.startswith(b"\x76\x2f\x31\x01"):
+        return lambda change, random_: _in_exr(content, random_)
+    return None
+
+
+def _in_archive(content, change, random_):
+    with zipfile.ZipFile(io.BytesIO(content)) as archive:
+        members = {name: archive.read(name) for name in archive.namelist()}
+    name = random_.choice(list(members))
+    members[name] = change(members[name])
+    stream = io.BytesIO()
+    with zipfile.ZipFile(stream, "w", zipfile.ZIP_DEFLATED) as archive:
+        for other, part in members.items():
+            archive.writestr(other, part)
+    return stream.getvalue()
+
+
+def _in_png(content, change, random_):
+    at, chunks = 8, []
+    while at < len(content):
+        (size,) = struct.unpack_from(">I", content, at)
+        chunks.append((content[at + 4 : at + 8], content[at + 8 : at + 8 + size]))
+        at += 12 + size
+    chosen = random_.randrange(len(chunks))
+    name, part = chunks[chosen]
+    chunks[chosen] = name, zlib.compress(change(zlib.decompress(part))) if name == b"IDAT" else change(part)
+    return content[:8] + b"".join(
+        struct.pack(">I", len(part)) + name + part + struct.pack(">I", zlib.crc32(name + part)) for name, part in chunks
+    )
+
+
+def _in_exr(content, random_):
+    """The file with another value in its header, or in a channel."""
+    with TemporaryDirectory() as folder:
+        path = Path(folder) / "a.exr"
+        path.write_bytes(content)
+        file = OpenEXR.File(str(path), separate_channels=True)
+        header = {name: value for name, value in file.header().items() if name not in ("channels", "dataWindow")}
+        channels = {name: np.array(channel.pixels) for name, channel in file.channels().items()}
+        numbers = [name for name, value in header.items() if isinstance(value, int | float | np.ndarray | str)]
+        numbers = [name for name in numbers if name not in ("name", "format", "formatVersion", "contentSha256")]
+        if random_.random() < 0.75 and numbers:
+            name = random_.choice(numbers)
+            header[name] = _other(header[name], random_)
+        else:
+            values = channels[random_.choice(list(channels))]
+            with np.errstate(all="ignore"):
+                if random_.random() < 0.5:
+                    values[...] *= np.float32(random_.choice((-1, 1e30, 1e6, 0)))
+                else:
+                    values.flat[random_.randrange(values.size)] = random_.choice(_VALUES)
+        try:
+            OpenEXR.File(header, channels).write(str(path))
+        except Exception:  # what cannot be written
+            return content
+        return path.read_bytes()
+
+
+def _other(value, random_):
+    if isinstance(value, str):
+        if random_.random() < 0.5:
+            return _changed(value.encode(), random_).decode("latin-1").replace("\0", "")
+        return random_.choice(("", "\x1b[31mred", 100_000 * "[", "x" * 10**6, '{"layout": 1, "values": ""}', "none"))
+    other = random_.choice(_VALUES)
+    if isinstance(value, np.ndarray):
+        changed = np.array(value)
+        changed.flat[random_.randrange(value.size)] = other
+        return changed
+    return type(value)(other) if np.isfinite(other) and abs(other) < 2**31 else value
+
+
+# ---------------------------------------------------------------- crafted files
+
+
+def _npz_of_zeros():
+    stream = io.BytesIO()
+    with zipfile.ZipFile(stream, "w", zipfile.ZIP_DEFLATED) as archive, archive.open("heights.npy", "w") as member:
+        np.lib.format.write_array_header_1_0(member, {"descr": "<f8", "fortran_order": False, "shape": (16000, 16000)})
+        for _ in range(16):
+            member.write(bytes(8 * 16000 * 1000))
+    return stream.getvalue()
+
+
+def _npy_header():
+    stream = io.BytesIO()
+    np.lib.format.write_array_header_1_0(stream, {"descr": "<f8", "fortran_order": False, "shape": (72000, 72000)})
+    return stream.getvalue() + bytes(100)
+
+
+def _black(side=13000, kind="PNG"):
+    return _saved(lambda stream: Image.new("L", (side, side)).save(stream, kind, compress_level=1))
+
+
+def _archive_of(main):
+    stream = io.BytesIO()
+    with zipfile.ZipFile(stream, "w", zipfile.ZIP_DEFLATED, compresslevel=1) as archive:
+        archive.writestr("main.xml", main)
+    return stream.getvalue()
+
+
+def _lying_archive():
+    """A member of 1 GB that is declared to have 100 bytes."""
+    content = bytearray(_archive_of(bytes(10**9)))
+    for signature, at in ((b"PK\3\4", 22), (b"PK\1\2", 24)):
+        struct.pack_into("<I", content, content.index(signature) + at, 100)
+    return bytes(content)
+
+
+def _black_exr(side=16001):
+    def write_rows(path):
+        header = OpenEXR.Header(side, side)
+        header["compression"] = Imath.Compression(Imath.Compression.ZIP_COMPRESSION)
+        header["channels"] = {"S0.500,0nm": Imath.Channel(Imath.PixelType(Imath.PixelType.FLOAT))}
+        header |= {
+            "spectralLayoutVersion": b"1.0",
+            "emissiveUnits": b"W.m^-2.sr^-1",
+            "contentSha256": UNSEALED.encode(),
+        }
+        file = OpenEXR.OutputFile(str(path), header)
+        for start in range(0, side, 1000):
+            rows = min(1000, side - start)
+            file.writePixels({"S0.500,0nm": bytes(4 * rows * side)}, rows)
+        file.close()
+
+    return _of_file(".exr", write_rows)
+
+
+def _with_channel(name):
+    header = {"spectralLayoutVersion": "1.0", "emissiveUnits": "W.m^-2.sr^-1"}
+    pixels = {channel: np.ones((2, 2), np.float32) for channel in ("S0.400nm", name)}
+    return _of_file(".exr", lambda path: OpenEXR.File(header, pixels).write(str(path)))
+
+
+def _with(powers=lambda values: values, **changed):
+    """A spectrum with other powers, or other entries of its header."""
+
+    def write_changed(path):
+        path.write_bytes(_spectrum("line"))
+        file = OpenEXR.File(str(path), separate_channels=True)
+        header = {name: value for name, value in file.header().items() if name not in ("channels", "dataWindow")}
+        channels = {name: powers(np.array(channel.pixels)) for name, channel in file.channels().items()}
+        OpenEXR.File(header | changed, channels).write(str(path))
+
+    return _of_file(".exr", write_changed)
+
+
+def _aliases():
+    lists = "".join(f"a{i}: &a{i} [{', '.join(8 * [f'*a{i - 1}' if i else '1'])}]\n" for i in range(8))
+    return f"{lists}DATA:\n  - type: formula 1\n    wavelength_range: 0.3 2\n    coefficients: *a7\n".encode()
+
+
+_STEPS = b'[surface]\nscan = "scan.npy"\npixel_size = 0.1\nprepare = [' + 1000 * b'"level_plane", ' + b"]\n"
+
+# Name → a file that is refused, the suffix of its name, and how it is read.
+CRAFTED = {
+    "aliases": (".yml", _aliases, read_index),
+    "deep_page": (".yml", lambda: 100_000 * b"[", read_index),
+    "range_without_end": (".yml", lambda: _FORMULA.replace(b"0.3 2.5", b"0 inf"), read_index),
+    "large_page": (".yml", lambda: b"[" + 500_000 * b"1," + b"]", read_index),
+    "dotted_key": (".toml", lambda: b"a" + 40_000 * b".a" + b" = 1\n", Recipe.load),
+    "many_steps": (".toml", lambda: _STEPS, Recipe.load),
+    "zero_in_a_name": (".toml", lambda: _OF_SCAN.replace(b"scan.npy", b"a\\u0000b.npy"), FORMATS["recipe"][2]),
+    "many_commas": (".txt", lambda: b"blazed" + 20_000 * b",a", _surface),
+    "comment_of_spaces": (".scan", lambda: b"#" + 4000 * b" " + b"1 2\n", _MICROMETRES),
+    "npy_header": (".npy", _npy_header, _MICROMETRES),
+    "no_wavelength": (".exr", lambda: _with_channel("S0.0Hz"), _read_spectral_image),
+    "no_number": (".exr", lambda: _with_channel("S0.1e400nm"), _read_spectral_image),
+    "nested_energy": (".exr", lambda: _with(energy=100_000 * "["), load_spectrum),
+    "wavelength_of_zero": (".exr", lambda: _with(wavelengths=np.array([0.0, 830.0])), load_spectrum),
+    "large_tile": (".exr", lambda: _with(tileSize=np.array([1e12, 1e12])), load_spectrum),
+    "negative_powers": (".exr", lambda: _with(lambda values: -values), load_spectrum),
+    "large_powers": (".exr", lambda: _with(lambda values: values + np.float32(1e30)), load_spectrum),
+    "long_source": (".exr", lambda: _with(source="x" * 3_000_000), load_spectrum),
+}
+# The same, of files that take seconds to make.
+SLOWLY_CRAFTED = {
+    "npz_of_zeros": (".npz", _npz_of_zeros, _MICROMETRES),
+    "black_scan": (".png", _black, _GREY),
+    "black_picture": (".png", _black, read_picture),
+    "elements": (".x3p", lambda: _archive_of(b"<a>" + 3_000_000 * b"<b/>" + b"</a>"), _INSTRUMENT),
+    "nested_elements": (".x3p", lambda: _archive_of(50_000 * b"<a>" + 50_000 * b"</a>"), _INSTRUMENT),
+    "many_elements": (".x3p", lambda: _archive_of(b"<a>" + 15_000_000 * b"<b/>" + b"</a>"), _INSTRUMENT),
+    "lying_archive": (".x3p", _lying_archive, _INSTRUMENT),
+    "lying_archive_of_another": (".plux", _lying_archive, _INSTRUMENT),
+    "black_spectral_image": (".exr", _black_exr, _read_spectral_image),
+    "black_spectrum": (".exr", _black_exr, load_spectrum),
+}
+# Files that are read, as large as the limits allow.
+LARGE = {
+    "brackets": (".csv", lambda: b"a" + 200_000 * b"[" + b"\n1,2\n3,4\n", _MICROMETRES),
+    "large_picture": (".png", lambda: _black(8192), read_picture),
+    "large_scan": (".png", lambda: _black(4096), _GREY),
+    "long_text": (".xyz", lambda: b"\n".join(b"%d %d 1" % divmod(k, 700) for k in range(700 * 700)), _scan(unit="um")),
+}
+
+# ---------------------------------------------------------------- the judge
+
+
+def fault(read, path, refused=None):
+    """What is wrong with how a file is read or refused, or ""; `refused`: which of the two it must be, if either."""
+    start, found, was_refused = time.process_time(), "", False
+    try:
+        read(path)
+    except MemoryError:
+        found = "more than 1 GB"
+    except Exception as error:
+        was_refused = True
+        if is_bug(type(error)):
+            found = f"a bug: {type(error).__name__}: {str(error)[:200]}"
+        elif "\n" in str(error) or "Unable to allocate" in str(error):
+            found = f"not refused in one line: {str(error)[:200]!r}"
+        elif refused is False:
+            found = f"refused: {str(error)[:200]}"
+    if refused and not was_refused:
+        found += " read"
+    if (seconds := time.process_time() - start) > MAX_SECONDS:
+        found += f" {seconds:.1f} s"
+    return found
+
+
+def write(path, content):
+    """Write a file; a spectrum with the digest that it then has."""
+    path.write_bytes(content)
+    if path.suffix == ".exr":
+        with suppress(ValueError):  # a picture has no placeholder for it
+            seal(path)
+
+
+def faults_of_mutants(name, count, folder, seed=0):
+    """Yield the number and the fault of those among `count` mutants that have one."""
+    suffix, make, read = FORMATS[name]
+    original, path = make(), folder / f"{name}{suffix}"
+    np.save(folder / "scan.npy", RELIEF)
+    write(path, original)
+    read(path)
+    for number in range(count):
+        write(path, mutant(original, random.Random(f"{name} {seed} {number}")))
+        if found := fault(read, path):
+            yield number, found
+
+
+def _limit_memory():
+    import resource
+
+    used = int(Path("/proc/self/statm").read_text().split()[0]) * resource.getpagesize()
+    resource.setrlimit(resource.RLIMIT_AS, (used + MAX_BYTES, resource.RLIM_INFINITY))
+
+
+def _in_this_process(names):
+    """Print the faults of crafted files, and of mutants ("FORMAT:COUNT"), in little memory."""
+    crafted = {**CRAFTED, **SLOWLY_CRAFTED, **LARGE}
+    with TemporaryDirectory() as name_of_folder:
+        folder = Path(name_of_folder)
+        for name in names:
+            if name in crafted:
+                suffix, make, _ = crafted[name]
+                write(folder / f"{name}{suffix}", make())
+        for name in {name.partition(":")[0] for name in names} & FORMATS.keys():
+            suffix, make, read = FORMATS[name]
+            path = folder / f"original{suffix}"
+            write(path, make())
+            np.save(folder / "scan.npy", RELIEF)
+            read(path)  # what it imports is not counted
+        _limit_memory()
+        for name in names:
+            kind, _, count = name.partition(":")
+            print(f"{name} …", file=sys.stderr, flush=True)
+            if kind in FORMATS:
+                for number, found in faults_of_mutants(kind, int(count), folder):
+                    print(f"{kind} {number}: {found}", flush=True)
+            else:
+                suffix, _, read = crafted[name]
+                if found := fault(read, folder / f"{name}{suffix}", name not in LARGE):
+                    print(f"{name}: {found}", flush=True)
+
+
+if __name__ == "__main__":
+    warnings.simplefilter("ignore")
+    _in_this_process(sys.argv[1:])

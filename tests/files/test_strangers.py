@@ -1,0 +1,67 @@
+"""Files from strangers are read or refused in one line, within 10 s and 1 GB of memory: crafted ones, and mutants."""
+
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+import strangers
+from test_instrument_files import needs_the_extra
+
+MUTANTS = 2000
+_OF_THE_EXTRA = (
+    "x3p",
+    "x3p_text",
+    "sur",
+    "tmd",
+    "nms",
+    "ibw",
+    "jpk",
+    "jpk_archive",
+    "park",
+    "nanoscope",
+    "nanoscope_text",
+)
+_SLOW_TO_MAKE = ("spectrum_rigorous", "spectrum_of_sample")
+
+
+def in_another_process(*names):
+    command = [sys.executable, str(Path(strangers.__file__)), *names]
+    done = subprocess.run(command, capture_output=True, text=True, timeout=1800)
+    assert (done.returncode, done.stdout) == (0, ""), done.stderr[-2000:]
+
+
+@pytest.mark.not_quick
+@pytest.mark.posix("limits the memory of a process")
+def test_crafted_files_are_refused():
+    in_another_process(*strangers.CRAFTED)
+
+
+@pytest.mark.slow
+@pytest.mark.posix("limits the memory of a process")
+@needs_the_extra
+@pytest.mark.parametrize("name", strangers.SLOWLY_CRAFTED)
+def test_files_that_unpack_to_gigabytes_are_refused(name):
+    in_another_process(name)
+
+
+@pytest.mark.slow
+@pytest.mark.posix("limits the memory of a process")
+@pytest.mark.parametrize("name", strangers.LARGE)
+def test_large_files_are_read_within_the_limits(name):
+    in_another_process(name)
+
+
+@pytest.mark.filterwarnings("ignore")
+@pytest.mark.parametrize("name", sorted(strangers.FORMATS.keys() - {*_OF_THE_EXTRA, *_SLOW_TO_MAKE}))
+def test_some_mutants_are_read_or_refused(name, tmp_path):
+    assert not list(strangers.faults_of_mutants(name, 5, tmp_path))
+
+
+@pytest.mark.slow
+@pytest.mark.posix("limits the memory of a process")
+@pytest.mark.parametrize(
+    "name", [pytest.param(name, marks=needs_the_extra if name in _OF_THE_EXTRA else ()) for name in strangers.FORMATS]
+)
+def test_mutants_are_read_or_refused(name):
+    in_another_process(f"{name}:{MUTANTS}")
