@@ -26,7 +26,7 @@ from ..errors import RequestError
 from ..progress import stage
 from ..scalar_theory.validity import Waves
 from ..settings import REPRESENTATIONS, ScalarSettings
-from ..spectrum.exr import doubles, one_line, read_channels, write_channels
+from ..spectrum.exr import MALFORMED, doubles, one_line, read_channels, write_channels
 from ..spectrum.grids import OrderGrid, SplineGrid
 from ..spectrum.power_spectrum import PowerSpectrum
 from ..spectrum.tables import AmplitudeTable, SliceTable
@@ -173,7 +173,7 @@ class GratingSpectrum(PowerSpectrum):
                 **{name: entries.pop(name) for name in ("coherence_length", "largest_angle", "tolerance")},
                 **series,
             )
-            return cls(
+            spectrum = cls(
                 table=table,
                 grid=_grid(header, table.shape),
                 settings=settings,
@@ -183,9 +183,11 @@ class GratingSpectrum(PowerSpectrum):
                 energy=EnergyTable.from_plain(json.loads(header["energy"])),
                 waves=Waves.from_plain(json.loads(header["waves"])) if "waves" in header else None,
             )
+            spectrum.check_powers()
+            return spectrum
         except KeyError as error:
             raise RequestError(f"{path}: a damaged spectrum, {error} is missing") from None
-        except (TypeError, ValueError, IndexError, AttributeError, OverflowError, MemoryError) as error:
+        except MALFORMED as error:
             raise RequestError(f"{path}: a damaged spectrum ({one_line(error)})") from None
 
 

@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 
 from ..errors import RequestError
 from ..files.outputs import MARK, png_text
+from ..files.reading import check_file
 from ..files.writing import encoded_file, whole_file
 from ..optics.color import (
     ViewTransform,
@@ -27,7 +28,7 @@ from ..optics.color import (
     spectrum_to_linear_sRGB,
     spectrum_to_XYZ,
 )
-from ..spectrum.exr import one_line, refuse_incomplete, silence
+from ..spectrum.exr import load_exr, refuse_incomplete, silence
 
 _LAYOUT_VERSION = "1.0"
 # Radiance is per nm, the unit in the channel names: the authors of the layout and pbrt-v4 omit the nm⁻¹, and
@@ -87,7 +88,11 @@ class SpectralImage:
     def __post_init__(self) -> None:
         wavelengths = np.array(self.wavelengths, dtype=np.float64)
         radiance = np.array(self.radiance, dtype=np.float32, order="C")
-        if wavelengths.ndim != 1 or wavelengths.size == 0 or not np.all(np.diff(wavelengths, prepend=0.0) > 0):
+        if (
+            wavelengths.ndim != 1
+            or wavelengths.size == 0
+            or not (np.isfinite(wavelengths).all() and np.all(np.diff(wavelengths, prepend=0.0) > 0))
+        ):
             raise RequestError(f"wavelengths: got {self.wavelengths!r}, wanted (n,) positive and ascending, nm")
         if radiance.ndim != 3 or radiance.size == 0 or radiance.shape[2] != wavelengths.size:
             raise RequestError(
@@ -203,18 +208,11 @@ class SpectralImage:
             ValueError: if it is not an OpenEXR file, not in this layout and version, has no emissive channels, or one
                 with another name than a wavelength or a frequency.
         """
-        import OpenEXR
-
-        if not Path(path).is_file():
-            raise FileNotFoundError(f"{os.fspath(path)}: no such file")
+        check_file(path, math.inf)
         try:
-            with silence():
-                file = OpenEXR.File(os.fspath(path), separate_channels=True)
-                header, channels = file.header(), file.channels()
-        except (RuntimeError, ValueError) as error:
-            raise RequestError(
-                f"{os.fspath(path)}: cannot be read as OpenEXR, is it whole? ({one_line(error)})"
-            ) from error
+            header, channels = load_exr(Path(path))
+        except RequestError as error:
+            raise RequestError(f"{os.fspath(path)}: {error}") from None
         for name, wanted in (("spectralLayoutVersion", _LAYOUT_VERSION), ("emissiveUnits", _UNITS)):
             if header.get(name) != wanted:
                 raise RequestError(f"{os.fspath(path)}: {name} is {header.get(name)!r}, wanted {wanted!r}")
@@ -224,6 +222,9 @@ class SpectralImage:
         for (one, first), (other, second) in itertools.pairwise(found):
             if one == other:
                 raise RequestError(f"{os.fspath(path)}: two channels of {one:g} nm, {first!r} and {second!r}")
+        shapes = {channels[name].pixels.shape for _, name in found}
+        if len(shapes) > 1:
+            raise RequestError(f"{os.fspath(path)}: got channels of {len(shapes)} sizes, wanted one")
         radiance = np.stack([channels[name].pixels for _, name in found], axis=-1)
         attributes = {
             name: value
@@ -270,7 +271,8 @@ def _notes(path: str | os.PathLike[str]) -> dict[str, str]:
     """Return what `save_preview` noted in a picture: text chunks of PNG, lines NAME=VALUE of the comment of JPEG."""
     from PIL import Image
 
-    with suppress(OSError, ValueError, Image.DecompressionBombError), Image.open(path) as picture:
+    damaged = OSError, SyntaxError, ValueError, AttributeError, Image.DecompressionBombError
+    with suppress(*damaged), Image.open(path, formats=("PNG", "JPEG")) as picture:
         comment = picture.info.get("comment", b"").decode()
         return {**picture.info, **dict(line.split("=") for line in comment.splitlines()[1:])}
     return {}

@@ -19,11 +19,13 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from ..array_types import Real
-from ..errors import RequestError
+from ..errors import RequestError, check_whole
+from ..optics.materials import MAX_INDEX
 from ..optics.media import MediumBelow
 from ..settings import RigorousSettings, lobe_cutoff, lobe_width
-from ..spectrum.exr import doubles, one_line, read_channels, write_channels
+from ..spectrum.exr import MALFORMED, doubles, one_line, read_channels, write_channels
 from ..spectrum.grids import OrderGrid
+from ..spectrum.power_spectrum import MAX_SOURCE
 from .solver import ODD, REVERSED
 
 RIGOROUS_FORMAT = "mitsuba_diffraction rigorous spectrum"
@@ -42,6 +44,7 @@ _STEPS = ("stepsF", "stepsX", "stepsZ")
 
 
 _EXCESS_MARGIN = 0.25
+_MAX_EXCESS = 0.05  # of efficiencies above one or below zero, by errors of the solver
 MAX_PERIOD_IN_WAVELENGTHS = 10.0
 """In units of the shortest wavelength: the table grows with the cube of the period, the time to build it faster."""
 
@@ -90,6 +93,20 @@ class Axes:
     steps: tuple[int, int, int]
     index: float = 0.0
     transmission: str = "none"
+
+    def __post_init__(self) -> None:
+        shortest, longest = self.wavelengths
+        if not (
+            0 < shortest < longest < np.inf and 0 < self.period <= MAX_PERIOD_IN_WAVELENGTHS * shortest * (1 + 1e-9)
+        ):
+            raise RequestError(
+                f"period, wavelengths: got {self.period} and {self.wavelengths} µm, wanted a period of at most "
+                f"{MAX_PERIOD_IN_WAVELENGTHS:g} wavelengths"
+            )
+        if not 0 <= self.index <= MAX_INDEX:
+            raise RequestError(f"index: got {self.index}, wanted one from 0 to {MAX_INDEX:g}")
+        for steps in self.steps:
+            check_whole("steps", steps, 1)
 
     @property
     def excess(self) -> float:
@@ -297,6 +314,16 @@ class RigorousSpectrum:
             table = getattr(self, name)
             if table is not None and (table.shape != wanted or table.dtype != np.float32):
                 raise RequestError(f"{name}: got {table.shape} of {table.dtype}, wanted {wanted} of float32")
+            if table is not None and not np.isfinite(table).all():
+                raise RequestError(f"{name}: got numbers that are not finite")
+        if not (self.values.min() >= -_MAX_EXCESS and self.values.max() <= 1 + _MAX_EXCESS):
+            got = f"{self.values.min():.3g} to {self.values.max():.3g}"
+            raise RequestError(f"values: got efficiencies from {got}, wanted 0 to 1")
+        check_whole("harmonics", self.harmonics, 0)
+        if not (isinstance(self.source, str) and isinstance(self.source_digest, str)):
+            raise RequestError(f"source: got {self.source!r}, {self.source_digest!r}, wanted texts")
+        if len(self.source) > MAX_SOURCE:
+            raise RequestError(f"source: got {len(self.source)} characters, wanted at most {MAX_SOURCE}")
 
     @property
     def transmission(self) -> str:
@@ -530,7 +557,7 @@ class RigorousSpectrum:
             )
         except KeyError as error:
             raise RequestError(f"{path}: a damaged spectrum, {error} is missing") from None
-        except (TypeError, ValueError, IndexError, AttributeError) as error:
+        except MALFORMED as error:
             raise RequestError(f"{path}: a damaged spectrum ({one_line(error)})") from None
 
 

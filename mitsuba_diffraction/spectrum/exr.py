@@ -5,6 +5,7 @@ from __future__ import annotations
 import contextlib
 import errno
 import io
+import math
 import os
 import sys
 import threading
@@ -17,22 +18,28 @@ import OpenEXR
 
 from ..errors import RequestError
 from ..files.outputs import MARK
+from ..files.reading import check_array
 from ..files.writing import UNSEALED, is_intact, seal, whole_file
 
+# Raised by what takes values of a header that are of another type, size or depth than those written.
+MALFORMED = (ArithmeticError, AttributeError, IndexError, MemoryError, RecursionError, TypeError, ValueError)
 # Streams belong to the whole process, and Mitsuba loads plugins on several threads.
 _silencing = threading.Lock()
 
 
 @contextlib.contextmanager
-def silence() -> Iterator[None]:
-    """Silence the messages of the OpenEXR library about a damaged file, from Python and from C."""
+def silence() -> Iterator[io.StringIO]:
+    """Silence the messages of the OpenEXR library about a damaged file, from Python and from C; yield those to Python.
+
+    For damaged pixels it raises no exception.
+    """
     with _silencing:
         sys.stderr.flush()
         saved, null = os.dup(2), os.open(os.devnull, os.O_WRONLY)
         try:
             os.dup2(null, 2)
-            with contextlib.redirect_stdout(io.StringIO()):
-                yield
+            with contextlib.redirect_stdout(io.StringIO()) as messages:
+                yield messages
         finally:
             os.dup2(saved, 2)
             os.close(saved)
@@ -89,14 +96,13 @@ def read_channels(path: Path, kind: str, version: int, recipe: str | None) -> tu
     if not path.is_file():
         raise FileNotFoundError(f"{path}: no such file")
     wanted = f"wanted a {kind.removeprefix('mitsuba_diffraction ')}, as mitsuba-diffraction precompute writes it"
-    # Before OpenEXR reads it: a wrong size in the header could exhaust memory.
+    # Before OpenEXR reads it, which finds only some damage.
     if not is_intact(path):
         raise RequestError(f"{path}: damaged, or another file (its SHA-256 is wrong or missing); {wanted}")
     try:
-        file = OpenEXR.File(str(path), separate_channels=True)
-        header, channels = file.header(), file.channels()
-    except Exception:
-        raise RequestError(f"{path}: no OpenEXR file; {wanted}") from None
+        header, channels = load_exr(path)
+    except RequestError as error:
+        raise RequestError(f"{path}: {error}; {wanted}") from None
     if header.get("format") != kind:
         raise RequestError(f"{path}: an OpenEXR file of another kind; {wanted}")
     if header.get("formatVersion") != version:
@@ -106,6 +112,29 @@ def read_channels(path: Path, kind: str, version: int, recipe: str | None) -> tu
         )
     if recipe not in (None, header.get("recipeSha256")):
         raise RequestError(f"{path}: a spectrum of another recipe")
+    return header, channels
+
+
+def load_exr(path: Path) -> tuple[dict[str, Any], dict[str, Any]]:
+    """Return header and channels of an OpenEXR file of one part; its size is checked before pixels are read.
+
+    Raises:
+        RequestError: if it is none, damaged, or larger than its bytes can be.
+    """
+    with silence() as messages:
+        try:
+            declared = OpenEXR.File(str(path), header_only=True).header()
+            (left, top), (right, bottom) = (corner.tolist() for corner in declared["dataWindow"])
+            shape = bottom - top + 1, right - left + 1, len(declared["channels"])
+            check_array(shape, path.stat().st_size, item_bytes=4, max_bytes=math.inf)
+            file = OpenEXR.File(str(path), separate_channels=True)
+            header, channels = file.header(), file.channels()
+        except RequestError:
+            raise
+        except Exception as error:
+            raise RequestError(f"cannot be read as OpenEXR, is it whole? ({one_line(error)})") from None
+    if text := " ".join(messages.getvalue().split()):
+        raise RequestError(f"cannot be read as OpenEXR, is it whole? ({text})")
     return header, channels
 
 

@@ -12,6 +12,8 @@ from numpy.typing import NDArray
 
 from ..errors import RequestError
 
+MAX_TILE = 1e6  # µm; of a larger tile, light reaches millions of orders
+
 
 class _Rectangle:
     """The nodes m = (m_x, m_y), |m_x| ≤ M_x, |m_y| ≤ M_y."""
@@ -61,8 +63,8 @@ class OrderGrid(_Rectangle):
     max_order: tuple[int, int]
 
     def __post_init__(self) -> None:
-        if not all(np.isfinite(t) and t > 0 for t in self.tile_size):
-            raise RequestError(f"tile_size: got {self.tile_size}, wanted two positive lengths in µm")
+        if not all(0 < t <= MAX_TILE for t in self.tile_size):
+            raise RequestError(f"tile_size: got {self.tile_size}, wanted two positive lengths up to {MAX_TILE:g} µm")
         super().__post_init__()
 
     @classmethod

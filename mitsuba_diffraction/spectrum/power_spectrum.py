@@ -15,6 +15,10 @@ from ..settings import ScalarSettings, lobe_width, matching
 from .grids import LobeAxis, OrderGrid, SplineGrid
 from .tables import AmplitudeTable, SliceTable
 
+MAX_SOURCE = 2**13  # characters of the origin of the heights, which messages and pages quote
+_MARGIN = 0.5  # of the sum of all powers: splines hold some at frequencies that no direction reaches
+_CHECKED = 8  # pairs of κ at which the powers of a series are checked
+
 
 @dataclass(frozen=True, eq=False)
 class PowerSpectrum:
@@ -64,6 +68,8 @@ class PowerSpectrum:
             raise RequestError(f"error: got {self.error}, wanted a fraction of the power")
         if not (isinstance(self.source, str) and isinstance(self.source_digest, str)):
             raise RequestError(f"source: got {self.source!r}, {self.source_digest!r}, wanted texts")
+        if len(self.source) > MAX_SOURCE:
+            raise RequestError(f"source: got {len(self.source)} characters, wanted at most {MAX_SOURCE}")
         if not (0 <= self.truncated_power <= 1 and 0 <= self.unresolved_power <= 1):
             got = f"{self.truncated_power}, {self.unresolved_power}"
             raise RequestError(f"truncated_power, unresolved_power: got {got}, wanted fractions of the power")
@@ -154,6 +160,22 @@ class PowerSpectrum:
             ValueError: if κ (rad/µm) is outside the range of the table.
         """
         return self.table.powers(float(self._checked(np.asarray(kappa, np.float64))))
+
+    def check_powers(self) -> None:
+        """Check the powers of a file: their sum is one but for the error and what was left out, and few are negative.
+
+        Raises:
+            RequestError: if they cannot be powers.
+        """
+        for kappa in np.linspace(0, self.max_kappa, 2 * getattr(self.table, "intervals", _CHECKED) + 1):
+            powers = self.table.powers(kappa)
+            total, negative = (float(part.sum(dtype=np.float64)) for part in (powers, np.minimum(powers, 0)))
+            margin = _MARGIN + self.error
+            if not (1 - margin - self.truncated_power - self.unresolved_power <= total <= 1 + margin >= 1 - negative):
+                raise RequestError(
+                    f"table: got powers of the sum {total:.3g}, of which {negative:.3g} are negative, at κ = "
+                    f"{kappa:.3g} rad/µm; wanted fractions of the reflected power, of the sum 1"
+                )
 
     def evaluate(self, q: ArrayLike, kappa: ArrayLike) -> NDArray[np.float64]:
         """Evaluate S(q; κ) from the table.
