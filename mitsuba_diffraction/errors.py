@@ -69,6 +69,11 @@ def shell_command(*words: str) -> str:
     return " ".join(word if re.fullmatch(r"[\w.:=/\\\[\]+-]+", word) else f'"{word}"' for word in words)
 
 
+def operand(name: str) -> str:
+    """Return the name of a file as a word that no command takes for an option."""
+    return f"./{name}" if name.startswith("-") else name
+
+
 def pip_install(extra: str) -> str:
     """Return the command that installs an extra of this package."""
     return shell_command("pip", "install", f"mitsuba_diffraction[{extra}]")

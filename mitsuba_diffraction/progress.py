@@ -5,6 +5,7 @@ from __future__ import annotations
 import codecs
 import io
 import math
+import re
 import sys
 import threading
 import time
@@ -40,6 +41,8 @@ _UNITS_OF_BYTES = ("GB", 1e9), ("MB", 1e6), ("kB", 1e3)
 _IN_ASCII = {"−": "-", "–": "-", "→": "->", "≤": "<=", "≥": ">=", "±": "+-", "×": "x", "·": "*"}
 _IN_ASCII |= {"µ": "u", "°": " deg", "²": "^2", "…": "...", "∫": "integral of "}
 _IN_ASCII |= {"λ": "lambda"}  # Unicode names it a lamda
+_CONTROL = re.compile(r"[\x00-\x08\x0b-\x1f\x7f-\x9f]")  # all but tabs and ends of lines
+_MAX_MESSAGE = 4000  # characters
 _lock = threading.Lock()
 _stages: list[str] = []  # nested blocks of code, the innermost last
 _durations: dict[str, float] = {}  # s, by the name of a stage
@@ -126,15 +129,23 @@ def _in_words(error: UnicodeError) -> tuple[str | bytes, int]:
     return text, error.start + 1
 
 
+def printable(text: str) -> str:
+    """Return a text with escapes in the place of control characters, by which a file could command the terminal."""
+    return _CONTROL.sub(lambda found: f"\\x{ord(found[0]):02x}", text)
+
+
 def say(kind: str, message: object) -> None:
     """Print a message on stderr, in one line."""
-    err.print(f"{NAME}: {kind}: {' '.join(str(message).split())}", markup=False, emoji=False)
+    text = " ".join(str(message).split())
+    if len(text) > _MAX_MESSAGE:
+        text = f"{text[:_MAX_MESSAGE]} … ({len(text)} characters)"
+    err.print(printable(f"{NAME}: {kind}: {text}"), markup=False, emoji=False)
 
 
 def tell(text: str) -> None:
     """Print the result of a command."""
     # File names are not markup.
-    out.print(text, markup=False, emoji=False)
+    out.print(printable(text), markup=False, emoji=False)
 
 
 def show(*tables: RenderableType, width: int) -> None:
@@ -152,7 +163,7 @@ def table(columns: Iterable[str], rows: Iterable[Sequence[str]], texts: int = 1)
     for index, column in enumerate(columns):
         shown.add_column(column, justify="left" if index < texts else "right", no_wrap=True)
     for row in rows:
-        shown.add_row(*row)
+        shown.add_row(*(Text(printable(cell)) for cell in row))
     return shown
 
 

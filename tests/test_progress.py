@@ -125,3 +125,19 @@ def test_long_commands_print_how_long_their_stages_took(capsys, monkeypatch):
                 now[0] += 0.5
     # The first took less than ten seconds. Inner stages do not count for outer ones.
     assert capsys.readouterr().out == "took 10.1 s: powers 1.5, heights 7.6, other 1.0\n"
+
+
+def test_a_file_does_not_command_the_terminal(capsys):
+    """Names, and the origin that a spectrum states, may hold escape sequences."""
+    name = "\x1b]0;title\x07\x1b[31mred\x9b2J\r"
+    progress.tell(name)
+    progress.say("error", name)
+    progress.show(progress.table(["a"], [[f"{name}[/b]"]]), width=80)
+    shown = "".join(capsys.readouterr())
+    assert not set(shown) & {"\x1b", "\x07", "\x9b", "\r"}
+    assert shown.count(r"\x1b[31mred\x9b2J") == 3
+
+
+def test_a_long_message_is_cut(capsys):
+    progress.say("error", 3_000_000 * "x")
+    assert len(capsys.readouterr().err) < 5000

@@ -134,7 +134,7 @@ class OrderEfficiencies:
         figure = Figure(figsize=(9, 5.2), dpi=120, layout="constrained")
         has_maps = min(len(self.angles), len(self.wavelengths)) > _MAX_PANELS
         (self._plot_maps if has_maps else self._plot_lines)(figure)
-        figure.suptitle(self.source, fontsize=10)
+        figure.suptitle(self.source, fontsize=10, parse_math=False)
         if path is not None:
             with whole_file(path) as temporary:
                 figure.savefig(temporary, metadata=METADATA)

@@ -46,10 +46,10 @@ def save_picture(inspection: Inspection, path: str | os.PathLike[str], *, title:
         raise RequestError(f"picture: got {os.fspath(path)!r}, wanted a file name that ends in .png, .pdf or .svg")
     source = inspection.height_field.source
     heading = textwrap.shorten(title or source, 80, placeholder=" …")
-    figure.text(0.04, 0.95, heading, fontsize=17, weight="bold", va="center")
+    figure.text(0.04, 0.95, heading, fontsize=17, weight="bold", va="center", parse_math=False)
     below = [] if title in (None, source) else [textwrap.shorten(source, 150, placeholder=" …")]
     below.append(_headline(inspection))
-    figure.text(0.04, 0.927, "\n".join(below), fontsize=11, color="0.25", va="top", linespacing=1.35)
+    figure.text(0.04, 0.927, "\n".join(below), fontsize=11, color="0.25", va="top", linespacing=1.35, parse_math=False)
     top = {"top": 0.82, "bottom": 0.41}
     left, middle, right = (
         figure.add_gridspec(1, 1, left=start, right=end, **top)[0]

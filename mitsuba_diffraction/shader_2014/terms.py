@@ -413,7 +413,7 @@ def plot_terms(found: Found) -> Figure:
             column[0].semilogy(curve.terms, curve.errors, label=label, **style)
             column[1].semilogy(curve.terms, curve.relative_errors, **style)
         _plot_bounds(column[0], curves)
-        column[0].set_title(surface, fontsize=10)
+        column[0].set_title(surface, fontsize=10, parse_math=False)
         for panel in column:
             panel.axvline(
                 PUBLISHED_TERMS, color="0.7", linewidth=0.8, zorder=0, label=f"{PUBLISHED_TERMS} terms, published"

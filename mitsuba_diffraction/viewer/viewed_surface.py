@@ -10,7 +10,7 @@ from typing import Any
 
 import numpy as np
 
-from ..errors import RequestError, did_you_mean, is_number, shell_command
+from ..errors import RequestError, did_you_mean, is_number, operand, shell_command
 from ..files.writing import examples_folder
 from ..optics.materials import refractive_index
 from ..optics.media import DEFAULT_INT_IOR
@@ -197,7 +197,7 @@ class Surface:
             grating = {"filename": f"{path.stem}.exr"}
             extent = {} if is_recipe else {"extent": recipe.settings.extent}
             text = written(name, own | extent)
-            command = shell_command(NAME, "precompute", text, "-o", f"{path.stem}.exr")
+            command = shell_command(NAME, "precompute", operand(text), "-o", operand(f"{path.stem}.exr"))
         return cls.of_recipe(recipe, path.stem, grating, parameters, progress, command)
 
 

@@ -230,6 +230,12 @@ def test_a_table_is_printed():
     assert len(rows) == 2 + len(one.orders) + len(one.transmitted_orders)
 
 
+def test_a_name_is_no_formula_of_the_plot(tmp_path):
+    field = md.gratings.blazed(2.5, 0.25)
+    named = md.HeightField(field.heights, field.pixel_size, r"a $\frac{$.npy")
+    md.efficiencies(named, [0], [550]).plot(tmp_path / "plot.png")
+
+
 @pytest.mark.parametrize(("angles", "panels", "maps"), [([0], 1, 0), ([0, 10], 2, 0), (np.linspace(0, 60, 6), 7, 6)])
 def test_a_plot_has_lines_or_of_many_points_a_map_for_each_order(angles, panels, maps, tmp_path):
     found = md.efficiencies(md.gratings.blazed(2.5, 0.25), angles, [400, 450, 500, 550, 600])

@@ -351,6 +351,12 @@ def test_a_flat_surface_is_inspected(tmp_path):
     save_picture(flat, tmp_path / "flat.png")
 
 
+def test_a_name_is_no_formula_of_the_slide(tmp_path):
+    # Regression: matplotlib takes what stands between dollar signs as mathematics, and raises for this.
+    flat = inspect(md.HeightField(np.zeros((40, 40)), 0.08, r"a $\frac{$.npy"))
+    save_picture(flat, tmp_path / "flat.png", title=r"$\frac{$")
+
+
 def test_the_picture_is_a_slide(sample, tmp_path):
     path = tmp_path / "slide.png"
     save_picture(sample, path, title="waves")

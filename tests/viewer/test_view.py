@@ -62,6 +62,13 @@ def test_a_recipe_of_the_package_has_its_name_in_the_saved_scene_and_in_its_comm
     assert changed.command == shell_command("mitsuba-diffraction", "precompute", surface, "-o", "blaze.exr")
 
 
+def test_a_name_with_a_hyphen_is_no_option_of_the_command(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    np.save("-o.npy", np.zeros((4, 4)))
+    shown = Surface.named("-o.npy", {"pixel_size": 0.05, "extent": "tile"})
+    assert shown.command == "mitsuba-diffraction precompute ./-o.npy,pixel_size=0.05,extent=tile -o ./-o.exr"
+
+
 @pytest.mark.slow
 def test_all_kinds_of_surfaces_are_shown(command, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)

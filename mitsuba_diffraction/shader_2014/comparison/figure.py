@@ -110,7 +110,7 @@ def comparison_figure(comparison: Comparison, *, others: bool = False) -> Figure
         picture = shown(comparison, name)
         axes = panel(column, tops[0])
         axes.imshow(picture)
-        axes.set_title(_title(comparison, name), fontsize=_TITLE)
+        axes.set_title(_title(comparison, name), fontsize=_TITLE, parse_math=False)
         rows, lines = window
         corner, size = (lines.start, rows.start), (lines.stop - lines.start, rows.stop - rows.start)
         axes.add_patch(Rectangle(corner, *size, fill=False, edgecolor="white", linewidth=1.5))

@@ -232,7 +232,7 @@ def plot_series(found: SeriesStudy) -> Figure:
             row, xyz = by_row[origin if count else "mean", count]
             pixels = on_screen(into_gamut(XYZ_to_linear_sRGB(xyz / white)))
             top[column].imshow(pixels, interpolation="nearest")
-            top[column].set_title(row.name, fontsize="medium")
+            top[column].set_title(row.name, fontsize="medium", parse_math=False)
             if count:
                 colours = np.full(found.shown.shape, np.nan)
                 colours[found.shown] = _delta_e(xyz, expected, found.shown, white)
@@ -256,5 +256,5 @@ def plot_series(found: SeriesStudy) -> Figure:
         panel.set_xlabel("number of terms N")
         panel.grid(alpha=0.25)
         panel.legend(fontsize="small", frameon=False)
-    figure.suptitle(f"{found.scene}, {found.samples} samples per pixel", fontsize=10)
+    figure.suptitle(f"{found.scene}, {found.samples} samples per pixel", fontsize=10, parse_math=False)
     return figure
