@@ -15,24 +15,10 @@ from __future__ import annotations
 import drjit as dr
 import mitsuba as mi
 
-from ..errors import RequestError
 from ..optics.materials import RefractiveIndex
+from ..optics.media import Media
 from .device_tables import opaque
-from .indices import Dispersion, absolute_index, index_from
-
-SAME_INDEX = 1e-3  # indices of refraction that differ by less, as for air and vacuum, are taken as equal
-
-
-def coat_from(props: mi.Properties) -> Coat | None:
-    """Return the layer given by `coat_ior`, or None, also for one that has the index of the outside.
-
-    Raises:
-        RequestError: if its index is below one or below the index of the outside.
-    """
-    if "coat_ior" not in props:
-        return None
-    coat = Coat(index_from("coat_ior", props["coat_ior"]), absolute_index("ext_ior", props.get("ext_ior", "air")))
-    return None if coat.relative < 1 + SAME_INDEX else coat
+from .indices import Dispersion
 
 
 class Coat:
@@ -40,20 +26,18 @@ class Coat:
 
     Attributes:
         medium: n of the layer, absolute, over the wavelength.
-        index: n in the middle of visible light.
-        relative, eta: this n relative to the outside, as a number and as an array.
+        eta: n relative to the outside in the middle of visible light.
         dispersion: n relative to the outside over the wavelength; None if it is constant.
     """
 
-    def __init__(self, medium: RefractiveIndex, outside: float) -> None:
-        self.medium, self.index = medium, medium.nominal.real
-        if self.index < max(1, (1 - SAME_INDEX) * outside):
-            raise RequestError(
-                f"coat_ior: got {self.index:g}, wanted at least one and that of the outside, {outside:g}"
-            )
-        self.relative = max(self.index / outside, 1.0)
-        self.eta = opaque(self.relative)
-        self.dispersion = None if medium.is_constant else Dispersion([medium], outside)
+    def __init__(self, medium: RefractiveIndex, media: Media) -> None:
+        self.medium, self.eta = medium, opaque(media.coat_index)
+        self.dispersion = None if medium.is_constant else Dispersion([medium], media.above.nominal.real)
+
+    @classmethod
+    def of(cls, media: Media) -> Coat | None:
+        """Return the layer over a relief, if there is one."""
+        return None if media.coat is None else cls(media.coat, media)
 
     def etas(self, si: mi.SurfaceInteraction3f) -> list[mi.Float]:
         """Return n of each wavelength, relative to the outside."""

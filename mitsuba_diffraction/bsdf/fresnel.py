@@ -11,11 +11,11 @@ import numpy as np
 from ..errors import RequestError
 from ..optics.film_stack import Stack
 from ..optics.materials import MAX_INDEX, MIN_INDEX, KnownRange, RefractiveIndex, constant, index_of, is_file
-from ..optics.media import DEFAULT_INT_IOR
+from ..optics.media import DEFAULT_INT_IOR, Media, MediumBelow
 from .base import nested_plugin
 from .coat import Coat
 from .device_tables import opaque
-from .indices import Dispersion, absolute_index, check_spectra, index_from, known_spectrum, nodes_of
+from .indices import Dispersion, check_spectra, index_from, known_spectrum, nodes_of
 
 Cosines: TypeAlias = "mi.Float | mi.UnpolarizedSpectrum"
 
@@ -87,34 +87,40 @@ class Material:
         """Show the parameters."""
 
 
-def reflectance_from(props: mi.Properties, coat: Coat | None) -> Material:
-    """Return the material given by `int_ior`, `ext_ior`, `material`, `eta` and `k`, relative to a coat if there is one.
+def below_from(props: mi.Properties) -> MediumBelow:
+    """Return the medium given by `int_ior`, `material`, or `eta` and `k`.
 
     Raises:
         RequestError: if they contradict each other or are unknown.
     """
     own = [name for name in ("eta", "k") if name in props]
-    above = None if coat is None or coat.dispersion is None else coat
     if "material" not in props and not own:
-        outside = coat.index if coat is not None else absolute_index("ext_ior", props.get("ext_ior", "air"))
-        return Dielectric(index_from("int_ior", props.get("int_ior", DEFAULT_INT_IOR)), outside, above)
+        return MediumBelow("int_ior", index_from("int_ior", props.get("int_ior", DEFAULT_INT_IOR)))
     named = own[0] if own else "material"
     if "int_ior" in props or ("ext_ior" in props and "coat_ior" not in props):
         raise RequestError(
             f"{named}: a conductor or a perfect mirror takes no int_ior or ext_ior; give one or the other"
         )
-    # There is no coat if its index equals the index of the outside.
-    outside = coat.index if coat is not None else absolute_index("ext_ior", props.get("ext_ior", 1.0))
     if own:
         if "material" in props or own == ["k"]:
             raise RequestError(f"{named}: got {' and '.join(own)}, wanted eta and k, or material, one or the other")
-        return SpectralConductor(props.get_texture("eta"), props.get_texture("k", 0.0), outside, above)
+        return MediumBelow("eta", None)
     material = props["material"]
     if not isinstance(material, str):
         raise RequestError(f"material: got {material!r}, wanted the name of a conductor, such as 'Al', or 'none'")
-    if material == "none":
-        return PerfectMirror()
-    return Conductor(conductor_from(material), outside, above)
+    return MediumBelow("material", None if material == "none" else conductor_from(material))
+
+
+def reflectance_from(props: mi.Properties, media: Media, coat: Coat | None) -> Material:
+    """Return R of the medium below, relative to a coat if there is one; `eta` and `k` are spectra of the scene."""
+    below, above = media.below, None if coat is None or coat.dispersion is None else coat
+    if below.parameter == "int_ior":
+        assert below.index is not None
+        return Dielectric(below.index, (media.coat or media.above).nominal.real, above)
+    outside = media.outside if media.coat is None else media.coat.nominal.real
+    if below.parameter == "eta":
+        return SpectralConductor(props.get_texture("eta"), props.get_texture("k", 0.0), outside, above)
+    return PerfectMirror() if below.index is None else Conductor(below.index, outside, above)
 
 
 def conductor_from(material: str) -> RefractiveIndex:

@@ -43,7 +43,7 @@ class Grating:
     """
 
     def __init__(self, request: GratingRequest) -> None:
-        self.coat, self.scales = request.media.coat, request.scales
+        self.coat, self.scales = request.coat, request.scales
         self.orientation, self.from_radius = request.orientation, request.from_radius
         surface = request.surface
         self.recipe = surface if isinstance(surface, Recipe) else None

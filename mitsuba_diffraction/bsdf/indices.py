@@ -77,11 +77,6 @@ def _of_dielectric(index: float | str) -> float:
     return float(np.ravel(mi.traverse(interface)["eta"])[0])
 
 
-def absolute_index(name: str, index: float | str) -> float:
-    """Return the index of a medium whose dispersion is left out, such as the one outside."""
-    return index_from(name, index).nominal.real
-
-
 class Dispersion:
     """n + ik of media relative to the one outside, linear between equidistant wavelengths; constant outside of them."""
 

@@ -49,7 +49,7 @@ class Layers:
     """
 
     def __init__(self, request: GratingRequest) -> None:
-        self.coat, self.base = request.media.coat, request.base
+        self.coat, self.base = request.coat, request.base
         self.grating = Grating(request)
         flags = mi.BSDFFlags.GlossyReflection | mi.BSDFFlags.Anisotropic | mi.BSDFFlags.FrontSide
         varying = [*self.grating.scales, self.grating.theory.material]

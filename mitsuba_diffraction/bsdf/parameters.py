@@ -15,8 +15,8 @@ import numpy as np
 from ..errors import RequestError, is_number
 from ..handed_over_spectra import handed_over
 from ..optics.geometry import SHADOWING
-from ..optics.materials import KnownRange, RefractiveIndex, is_file
-from ..optics.media import DEFAULT_INT_IOR, MediumBelow
+from ..optics.materials import KnownRange, is_file
+from ..optics.media import Media, MediumBelow
 from ..precomputation.recipe import REQUESTED, Recipe, kind_of, source_named
 from ..precomputation.requested_surface import RequestedSurface
 from ..precomputation.spectra import Spectrum, load_spectrum
@@ -34,9 +34,9 @@ from ..settings import (
 )
 from ..surface.gratings import PROFILES
 from .base import Base, base_from, nested_plugin
-from .coat import SAME_INDEX, Coat, coat_from
+from .coat import Coat
 from .device_tables import larger
-from .fresnel import Conductor, Material, PerfectMirror, SpectralConductor, reflectance_from
+from .fresnel import Material, below_from, reflectance_from
 from .indices import index_from
 from .thin_film import with_film
 from .varying import VaryingNumber, check_texture, numbers_from
@@ -58,78 +58,19 @@ _SCALAR_ONLY = {
 }
 
 
-@dataclass(frozen=True)
-class Media:
-    """The media of a scene, from `ext_ior`, `coat_ior`, `int_ior` and `transmission`.
+def media_from(props: mi.Properties) -> Media:
+    """Return the media of a scene, from `ext_ior`, `coat_ior`, `int_ior` or `material`, and `transmission`.
 
-    Attributes:
-        outside: absolute index of the uppermost medium; one for air and vacuum.
-        coat: the layer over the relief.
-        transmission: "none", "interface" or "sheet".
-        eta: index of the transparent material relative to the outside, in the middle of visible light; None without
-            transmission.
-        densest: the maximum absolute index next to the relief at any visible wavelength.
-        known: where the indices of the outside and of the coat are known.
+    Raises:
+        RequestError: if an index is out of range, or the material does not transmit.
     """
-
-    outside: float
-    coat: Coat | None
-    transmission: str
-    eta: float | None
-    densest: float
-    known: tuple[KnownRange, ...]
-
-    @classmethod
-    def of(cls, props: mi.Properties) -> Media:
-        """Return the media from the parameters of a scene.
-
-        Raises:
-            RequestError: if an index is out of range, or the material does not transmit.
-        """
-        coat = coat_from(props)
-        above = index_from("ext_ior", props.get("ext_ior", "air"))
-        exterior = above.nominal.real
-        coats = () if coat is None else (coat.medium.known("coat_ior", clear=True),)
-        known = above.known("ext_ior", clear=True), *coats
-        outside = 1.0 if abs(exterior - 1) < SAME_INDEX else exterior
-        kind = props.get("transmission", TRANSMISSIONS[0])
-        if kind not in TRANSMISSIONS:
-            raise RequestError(f"transmission: got {kind!r}, wanted one of {', '.join(TRANSMISSIONS)}")
-        if kind == "none":
-            densest = outside if coat is None else outside * coat.relative * _densest(coat.medium, coat.index)
-            return cls(outside, coat, kind, None, densest, known)
-        for name in ("material", "base", "coat_ior", "eta", "k"):
-            if name in props:
-                got = repr(props[name]) if isinstance(props[name], str | float | int) else "a BSDF"
-                raise RequestError(f"{name}: got {got} with transmission={kind}, wanted a dielectric (int_ior) alone")
-        # Computed as by `Dielectric`, so that both are equal.
-        medium = index_from("int_ior", props.get("int_ior", DEFAULT_INT_IOR))
-        eta = medium.nominal.real / exterior
-        if abs(eta - 1) < SAME_INDEX:
-            raise RequestError(f"int_ior: got that of the outside with transmission={kind}, wanted another one")
-        densest = outside * max(1.0, eta * _densest(medium, medium.nominal.real))
-        return cls(outside, coat, kind, eta, densest, known)
-
-    @property
-    def index(self) -> float:
-        """The maximum absolute index next to the relief, by which wavelengths are divided there."""
-        return self.densest
-
-    @property
-    def index_name(self) -> str:
-        """The parameter that gives `index`."""
-        if self.coat is not None:
-            return "coat_ior"
-        return "int_ior" if self.eta is not None and self.eta > 1 else "ext_ior"
-
-    def with_eta(self, eta: float) -> Media:
-        """Return the media with another relative index of the material."""
-        return replace(self, eta=eta, densest=self.outside * max(1.0, eta))
-
-
-def _densest(medium: RefractiveIndex, nominal: float) -> float:
-    """Return the maximum index of a medium at visible wavelengths relative to its nominal one."""
-    return float(medium(np.linspace(*VISIBLE, 100) * 1e-3).real.max() / nominal)
+    kind = props.get("transmission", TRANSMISSIONS[0])
+    for name in ("material", "base", "coat_ior", "eta", "k") if kind in TRANSMISSIONS[1:] else ():
+        if name in props:
+            got = repr(props[name]) if isinstance(props[name], str | float | int) else "a BSDF"
+            raise RequestError(f"{name}: got {got} with transmission={kind}, wanted a dielectric (int_ior) alone")
+    coat = index_from("coat_ior", props["coat_ior"]) if "coat_ior" in props else None
+    return Media(below_from(props), index_from("ext_ior", props.get("ext_ior", "air")), coat, kind)
 
 
 class Scales:
@@ -218,11 +159,11 @@ class Scales:
             )
 
 
-def surface_from(props: mi.Properties, media: Media, bare: Material, scale: float = 1.0) -> Spectrum | Recipe:
+def surface_from(props: mi.Properties, media: Media, scale: float = 1.0) -> Spectrum | Recipe:
     """Return the spectrum given by `filename` or `spectrum`, or the recipe given by `filename` or `profile`.
 
     The recipe is for the wavelengths λ/n in a coat or a dielectric, divided by the maximum `scale`, and, if it is
-    rigorous, for the material `bare`. Its spectrum is not computed here, so that all other parameters can be checked
+    rigorous, for the medium below. Its spectrum is not computed here, so that all other parameters can be checked
     before.
 
     Raises:
@@ -250,7 +191,7 @@ def surface_from(props: mi.Properties, media: Media, bare: Material, scale: floa
         if props.get("theory", found) != found:
             raise RequestError(f"theory: got {theory!r} with a spectrum of {found} theory, wanted one built for it")
         return surface
-    settings = {"theory": theory, **_material_settings(props, bare, media.coat)} if theory == "rigorous" else {}
+    settings = {"theory": theory, **_material_settings(props, media)} if theory == "rigorous" else {}
     return _inside(media, scale, Recipe.of_profile(props["profile"], props, **_requested(props), **settings))
 
 
@@ -326,23 +267,20 @@ def _from_file(props: mi.Properties, media: Media, scale: float) -> Spectrum | R
     )
 
 
-def _material_settings(props: mi.Properties, bare: Material, coat: Coat | None) -> dict[str, Any]:
+def _material_settings(props: mi.Properties, media: Media) -> dict[str, Any]:
     """Return `material` or `int_ior` for `precompute`, the index relative to the outside.
 
     Raises:
-        RequestError: if they are unknown, or the material is the perfect mirror.
+        RequestError: if they are two spectra, or the material is the perfect mirror.
     """
-    if isinstance(bare, Conductor):
-        return {"material": _resolved(props["material"])}
-    if isinstance(bare, SpectralConductor):
+    below = media.below
+    if below.parameter == "eta":
         raise RequestError("eta: got spectra with theory=rigorous, wanted the name of a conductor or a file: material")
-    if bare.dispersion is not None:
-        return {"int_ior": _resolved(props["int_ior"])}
-    if isinstance(bare, PerfectMirror):
-        raise RequestError("material: got 'none', wanted a real one for theory=rigorous, such as 'Al'")
-    # Rounded to the digits of a float32.
-    eta = float(np.max(bare.eta)) * (1 if coat is None else coat.relative)
-    return {"int_ior": float(f"{eta:.6g}")}
+    below.check_theory("rigorous")
+    assert below.index is not None
+    if below.index.is_constant:  # rounded to the digits of a float32
+        return {"int_ior": float(f"{media.eta:.6g}")}
+    return {below.parameter: _resolved(props[below.parameter])}
 
 
 def _resolved(index: str) -> str:
@@ -352,8 +290,8 @@ def _resolved(index: str) -> str:
 
 def _media_settings(media: Media) -> dict[str, Any]:
     """Return the settings for `precompute` that follow from the coat, the transmission and the variant."""
-    medium: dict[str, Any] = {} if media.coat is None else {"ext_ior": float(f"{media.coat.relative:.6g}")}
-    if media.transmission != "none":
+    medium: dict[str, Any] = {} if media.coat is None else {"ext_ior": float(f"{media.coat_index:.6g}")}
+    if media.transmits:
         medium["transmission"] = media.transmission
     return {**medium, "polarised": True} if mi.is_polarized else medium
 
@@ -400,11 +338,11 @@ def check_rigorous(spectrum: RigorousSpectrum, request: GratingRequest) -> None:
             f"theory: got a rigorous spectrum of unpolarised light in the variant {mi.variant()}, wanted one that was "
             "built with polarised=True"
         )
-    medium = 1.0 if coat is None else coat.relative
+    medium = media.coat_index
     if abs(spectrum.settings.ext_ior - medium) > 1e-3 * medium:
         raise RequestError(
-            f"coat_ior: got {'none' if coat is None else f'{coat.index:g}'}, but the rigorous spectrum is of a grating "
-            f"below a medium of index {spectrum.settings.ext_ior:g}: build it with ext_ior={medium:.4g}"
+            f"coat_ior: got {'none' if coat is None else f'{coat.nominal.real:g}'}, but the rigorous spectrum is of a "
+            f"grating below a medium of index {spectrum.settings.ext_ior:g}: build it with ext_ior={medium:.4g}"
         )
     if stated is None:
         return
@@ -422,6 +360,7 @@ class GratingRequest:
 
     Attributes:
         media: around the grating.
+        coat: the layer over it, or None.
         scales: of heights and of lengths along the surface; one in rigorous theory.
         scale: the maximum of both, for which a recipe in `surface` is made.
         orientation: degrees from the tangent to the pattern's x axis.
@@ -436,6 +375,7 @@ class GratingRequest:
     """
 
     media: Media
+    coat: Coat | None
     scales: Scales
     scale: float
     orientation: mi.Texture
@@ -478,7 +418,7 @@ class GratingRequest:
         Raises:
             RequestError: if one is wrong, or they contradict each other.
         """
-        media, scales = Media.of(props), Scales(props)
+        media, scales = media_from(props), Scales(props)
         angle = props.get("orientation", 0.0)
         if isinstance(angle, float | int) and not (is_number(angle) and abs(angle) <= _MAX_DEGREES):
             raise RequestError(f"orientation: got {angle}, wanted degrees, up to {_MAX_DEGREES:g}, or a texture")
@@ -490,14 +430,15 @@ class GratingRequest:
         else:
             orientation = props.get_texture("orientation", 0.0)
         check_texture("orientation", orientation)
-        bare = reflectance_from(props, media.coat)
+        coat = Coat.of(media)
+        bare = reflectance_from(props, media, coat)
         scale, stated = scales.max_scale, None
-        surface = surface_from(props, media, bare, scale)
+        surface = surface_from(props, media, scale)
         if _theory_of(surface) == "rigorous":
             _refuse_scalar_only(props)
             # With a coat, `ext_ior` is the index above the coat.
             if any(name in props for name in ("material", "int_ior", *(["ext_ior"] if media.coat is None else []))):
-                stated = _material_settings(props, bare, media.coat)
+                stated = _material_settings(props, media)
         material, base = with_film(props, bare), base_from(props)
         if base is not None and not material.transparent:
             raise RequestError("base: got a BSDF below a conductor or a perfect mirror, which transmit no light")
@@ -509,6 +450,7 @@ class GratingRequest:
             raise RequestError(f"conserve_energy: got {conserve_energy!r}, wanted true or false")
         return cls(
             media=media,
+            coat=coat,
             scales=scales,
             scale=scale,
             orientation=orientation,

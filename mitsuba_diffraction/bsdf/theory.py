@@ -16,17 +16,18 @@ from ..energy.furnace import small_kappas
 from ..errors import RequestError
 from ..optics.film_stack import Stack
 from ..optics.geometry import SHADOWING
+from ..optics.media import SAME_INDEX, Media
 from ..precomputation.grating_spectrum import GratingSpectrum
 from ..precomputation.spectra import Spectrum
 from ..rigorous.rigorous_spectrum import RigorousSpectrum
 from ..settings import VISIBLE
-from .coat import SAME_INDEX, Coat
+from .coat import Coat
 from .device_tables import opaque
 from .directions import Geometry, Incidence, Interface, rotated
 from .energy_factor import Coordinates, Energy
 from .fresnel import Material, PerfectMirror
 from .order_sampler import MAX_INDEX_CHANGE, OrderSampler
-from .parameters import GratingRequest, Media, check_rigorous
+from .parameters import GratingRequest, check_rigorous
 from .polarisation import Split, of_facets, of_orders
 from .rigorous_orders import RigorousOrders
 from .shared import SharedTables, shared
@@ -193,6 +194,7 @@ class ScalarTheory(Theory):
     def __init__(self, spectrum: GratingSpectrum, request: GratingRequest) -> None:
         _check_error(spectrum)
         self.spectrum, self.media, self.scales = spectrum, request.media, request.scales
+        self.coat = request.coat
         self.material, self.shadowing = request.material, request.shadowing
         self.conserve_energy, self.largest_angle = request.conserve_energy, spectrum.largest_angle
         self.update()
@@ -232,7 +234,7 @@ class ScalarTheory(Theory):
         shortest, longest = self.spectrum.wavelengths
         self.wavelengths, self.light = (shortest * index, longest * index), light
         if light and self.spectrum.waves is not None:
-            outside = index if self.media.eta is None else self.media.outside
+            outside = self.media.outside if self.media.transmits else index
             error = self.spectrum.waves.error(light, outside, transparent=self.material.transparent)
             if error.warning:
                 _warn(self.spectrum.source, error.warning)
@@ -246,16 +248,15 @@ class ScalarTheory(Theory):
 
     def _stack(self) -> Stack | None:
         """Return the material and its films for E and for samplers, if light is transmitted."""
-        return None if self.media.eta is None else self.material.stack(self.media.eta)
+        return self.material.stack(self.media.eta) if self.media.transmits else None
 
     def _interface(self) -> Interface:
         """Return the media above and below, and set the sampler of orders for the current scales and index."""
-        coat, eta, is_sheet = self.media.coat, self.media.eta, self.media.transmission == "sheet"
-        scattering = self.tables.scattering(self.scales, is_sheet, 1.0 if coat is None else coat.relative)
-        self.scattering = scattering
-        if eta is None:
-            return _of_coat(coat)
-        kappas = tuple(opaque(kappa) for kappa in small_kappas(self.spectrum, eta, self.scales.laterals[0]))
+        is_sheet = self.media.transmission == "sheet"
+        self.scattering = scattering = self.tables.scattering(self.scales, is_sheet, self.media.coat_index)
+        if not self.media.transmits:
+            return _of_coat(self.coat)
+        kappas = tuple(opaque(kappa) for kappa in small_kappas(self.spectrum, self.media.eta, self.scales.laterals[0]))
         sampler = scattering.sampler
         fraction = sampler.transmitted_fraction if isinstance(sampler, OrderSampler) else None
         dispersions = None, self.material.dispersion
@@ -267,7 +268,7 @@ class ScalarTheory(Theory):
             scale.read()
         self.material.update()
         other_index = False
-        if self.media.eta is not None:
+        if self.media.transmits:
             # Tables are reused for nearly the same index, for the speed of scenes in which it varies smoothly.
             eta, before = float(np.max(dr.detach(self.material.eta))), self.media.eta
             if not 0 < eta < np.inf or abs(eta - 1) < SAME_INDEX:
@@ -339,15 +340,14 @@ class RigorousTheory(Theory):
     def __init__(self, spectrum: RigorousSpectrum, request: GratingRequest) -> None:
         check_rigorous(spectrum, request)
         self.media = media = request.media
-        coat = media.coat
         self.material = PerfectMirror(f"{spectrum.material_name}, in the efficiencies")
         self.scattering = shared((mi.variant(), spectrum.digest), lambda: RigorousOrders(spectrum))
-        if media.eta is None:
-            self.interface = _of_coat(coat)
+        if not media.transmits:
+            self.interface = _of_coat(request.coat)
         else:
             index, is_sheet = opaque(spectrum.int_ior.real), media.transmission == "sheet"
             self.interface = Interface(1.0, index, is_sheet, rigorous=True)
-        self.index = 1.0 if coat is None else media.index
+        self.index = 1.0 if media.coat is None else media.index
         shortest, longest = spectrum.wavelengths
         self.wavelengths = shortest * self.index, longest * self.index
 
@@ -377,7 +377,7 @@ class RigorousTheory(Theory):
         active: mi.Bool,
     ) -> Split:
         sin, cos = frame
-        relative = 1e3 if self.media.coat is None else 1e3 * self.media.coat.relative
+        relative = 1e3 * self.media.coat_index
 
         def entries(channel: int, source: mi.Vector3f, exit_: mi.Vector3f) -> list[list[mi.Float]]:
             frequency = relative / si.wavelengths[channel]

@@ -9,7 +9,6 @@ from typing import Annotated
 import typer
 
 from ..errors import RequestError
-from ..export.exported_grating import medium_in_air
 from ..files.outputs import check_outputs
 from ..inspection.efficiency import OrderEfficiencies, order_efficiencies
 from ..inspection.peaks import check_request, efficiencies_of_peaks
@@ -61,35 +60,34 @@ def efficiency(
     angles, wavelengths = incidence_of("--angle", angle), parse_numbers("--wavelength", wavelength)
     requested = RequestedSurface.of(surface, aside=_OF_LIGHT)
     name, theory = requested.title, requested.theory
-    settings = ScalarSettings() if requested.is_spectrum else requested.stated.settings
-    transmission = requested.aside.get("transmission", settings.chosen.get("transmission", "none"))
-    below = medium_in_air(settings.chosen, requested.aside)
+    media = requested.media
     if csv is not None:
         check_suffix("--csv", csv, ".csv")
     if plot is not None:
         check_suffix("--plot", plot, ".png", ".pdf", ".svg")
     writes = [(option, path) for option, path in (("--csv", csv), ("--plot", plot)) if path is not None]
     check_outputs(requested.files, writes, overwrite=overwrite)
-    if (irregular := requested.is_irregular) and (theory, transmission) != ("scalar", "none"):
+    if (irregular := requested.is_irregular) and (theory == "rigorous" or media.transmits):
         what, other = ("a saved spectrum", ", or its recipe") if requested.is_spectrum else ("an irregular surface", "")
         raise RequestError(
-            f"{name}: got theory {theory}, transmission {transmission} of {what}, wanted scalar, none{other}"
+            f"{name}: got theory {theory}, transmission {media.transmission} of {what}, wanted scalar, none{other}"
         )
     requested.say_extent()
     light = angles, wavelengths, azimuth
     found: OrderEfficiencies
     if irregular:
-        check_request(settings.wavelengths, angles, wavelengths, below)  # before a spectrum is computed
+        valid = (ScalarSettings() if requested.is_spectrum else requested.recipe.settings).wavelengths
+        check_request(valid, angles, wavelengths, media.below)  # before a spectrum is computed
         cached = requested.spectrum(partial(progress_bar, unit="%"))
         assert isinstance(cached, GratingSpectrum)
         with progress_bar(f"peaks of {name}") as progress:
-            found = efficiencies_of_peaks(cached, below, *light, progress)
+            found = efficiencies_of_peaks(cached, media.below, *light, progress)
         warning = cached.warning
     else:
         field = requested.period
         with progress_bar(f"efficiencies of {name}") as progress:
-            found = order_efficiencies(field, below, *light, theory, transmission, progress)
-            warning = scalar_error(field, below=below).warning if theory == "scalar" else ""
+            found = order_efficiencies(field, media, *light, theory, progress)
+            warning = scalar_error(field, below=media.below).warning if theory == "scalar" else ""
     tell(str(found))
     if warning:
         tell(f"! {warning}")

@@ -10,7 +10,7 @@ import typer
 
 from ..errors import RequestError
 from ..export.cycles import shader_recipe, write_shader
-from ..export.exported_grating import ExportedGrating, medium_in_air
+from ..export.exported_grating import ExportedGrating
 from ..export.lswm import write_lswm
 from ..export.order_table import write_order_table
 from ..files.outputs import check_outputs
@@ -110,10 +110,9 @@ def _write_shader(requested: RequestedSurface, output: Path) -> None:
     saved = requested.is_spectrum
     spectrum = requested.spectrum() if saved else shader_recipe(requested.recipe).cached(progress)
     assert isinstance(spectrum, GratingSpectrum)
-    chosen = {} if saved else requested.recipe.settings.chosen
-    if requested.is_film or chosen.get("transmission", "none") != "none":
+    if requested.is_film or requested.media.transmits:
         say("note", f"{title}: the shader shows the light that it reflects; `render` shows what it transmits")
-    held = write_shader(spectrum, output, medium_in_air(chosen, requested.aside))
+    held = write_shader(spectrum, output, requested.below)
     if spectrum.warning:
         tell(f"! {spectrum.warning}")
     tell(f"{output}: {spectrum.source}; {held}")

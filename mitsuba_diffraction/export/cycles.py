@@ -22,7 +22,7 @@ from ..files.writing import whole_file
 from ..inspection.efficiency import description
 from ..optics.color import SRGB_TO_XYZ, XYZ_to_linear_sRGB, daylight, matching_functions
 from ..optics.geometry import diffracted, fresnel
-from ..optics.media import MediumBelow
+from ..optics.media import Media, MediumBelow
 from ..precomputation.grating_spectrum import GratingSpectrum
 from ..precomputation.recipe import Recipe
 from ..settings import VISIBLE, wavelengths_inside
@@ -58,7 +58,7 @@ def write_shader(spectrum: GratingSpectrum, path: str | os.PathLike[str], below:
     Raises:
         ValueError: if the material is wrong.
     """
-    what = description(spectrum.source, below, 0.0)
+    what = description(spectrum.source, Media(below), 0.0)
     edges, colours = _wavelength_bins()
     index = np.array([below.at(w) for w in (edges[1:] + edges[:-1]) / 2])
     index = np.where(np.isinf(index), 0, index)

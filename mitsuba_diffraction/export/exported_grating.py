@@ -2,10 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from functools import cached_property
-from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -15,7 +14,7 @@ from ..errors import RequestError
 from ..inspection.efficiency import checked_numbers, description
 from ..inspection.order_solver import IncidentLight, OrderSolver, order_solver
 from ..optics.geometry import Orders
-from ..optics.media import MediumBelow
+from ..optics.media import Media, MediumBelow
 from ..precomputation.requested_surface import RequestedSurface
 from ..rigorous.coordinate_transformation import is_profile
 from ..settings import THEORIES
@@ -80,7 +79,6 @@ class ExportedGrating:
         Raises:
             ValueError: if the surface is not periodic, or as the class.
         """
-        recipe = requested.recipe
         if requested.is_irregular:
             raise RequestError(
                 f"{requested.title}: got an irregular surface, which has no orders, wanted a grating; the command "
@@ -89,12 +87,12 @@ class ExportedGrating:
         field = requested.period
         if is_profile(field):
             field = HeightField(field.heights[:1], field.pixel_size, field.source)
-        return cls(field, requested.theory, medium_in_air(recipe.settings.chosen, requested.aside), shortest)
+        return cls(field, requested.theory, requested.below, shortest)
 
     @property
     def description(self) -> str:
         """What it is, in one line."""
-        return description(self.height_field.source, self.below, 0.0, self.theory)
+        return description(self.height_field.source, Media(self.below), 0.0, self.theory)
 
     @property
     def period(self) -> tuple[float, float]:
@@ -132,18 +130,6 @@ class ExportedGrating:
             if self.theory == "scalar":
                 orders = Orders(orders.m, orders.s / total, orders.p / total)
             yield DiffractedSide(side, orders, light.directions(orders, self.period, side == "reflected"), amplitudes)
-
-
-def medium_in_air(chosen: Mapping[str, Any], parameters: Mapping[str, Any]) -> MediumBelow:
-    """Return the medium below a grating in air, from parameters or else those chosen in a recipe.
-
-    Raises:
-        ValueError: as `MediumBelow.of`, or if the grating lies below another medium than air.
-    """
-    outside = {**chosen, **parameters}.get("ext_ior", 1)
-    if outside != 1:
-        raise RequestError(f"ext_ior: got {outside} of the recipe, wanted none: these orders are in air")
-    return MediumBelow.requested(parameters, chosen)
 
 
 def checked_ranges(wavelengths: ArrayLike, angles: ArrayLike, azimuths: ArrayLike) -> tuple[Real, Real, Real]:

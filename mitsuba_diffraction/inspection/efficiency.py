@@ -14,10 +14,10 @@ from ..array_types import Real
 from ..errors import RequestError, is_number
 from ..files.outputs import MARK, METADATA
 from ..files.writing import whole_file
-from ..optics.media import MediumBelow
+from ..optics.media import Media, MediumBelow
 from ..progress import Progress, silent
 from ..rigorous.coordinate_transformation import is_profile
-from ..settings import THEORIES, TRANSMISSIONS
+from ..settings import THEORIES
 from ..surface.heightfield import HeightField
 from .order_solver import IncidentLight, order_solver
 
@@ -234,21 +234,20 @@ def efficiencies(
     """
     if not isinstance(height_field, HeightField):
         raise RequestError(f"height_field: got {type(height_field).__name__}, wanted a HeightField")
-    below = MediumBelow.of(material, int_ior)
-    return order_efficiencies(height_field, below, angles, wavelengths, azimuth, theory, transmission, progress)
+    media = Media(MediumBelow.of(material, int_ior), transmission=transmission)
+    return order_efficiencies(height_field, media, angles, wavelengths, azimuth, theory, progress)
 
 
 def order_efficiencies(
     height_field: HeightField,
-    below: MediumBelow,
+    media: Media,
     angles: ArrayLike | str,
     wavelengths: ArrayLike,
     azimuth: float,
     theory: str,
-    transmission: str,
     progress: Progress = silent,
 ) -> OrderEfficiencies:
-    """Compute `efficiencies` of a grating above a medium; the same arguments, errors and warnings."""
+    """Compute `efficiencies` of a grating in its media; the same arguments, errors and warnings."""
     wavelengths = checked_numbers("wavelengths", wavelengths, "nm from 10 to 100000 (100 µm)", 9.999, 100_000.001)
     angles = checked_angles(angles, wavelengths, height_field.tile_size[0], azimuth)
     incidence = at_wavelengths(angles, len(wavelengths))
@@ -256,14 +255,11 @@ def order_efficiencies(
         raise RequestError(f"theory: got {theory!r}, wanted one of {', '.join(THEORIES)}")
     if not is_number(azimuth) or not np.isfinite(azimuth):
         raise RequestError(f"azimuth: got {azimuth!r}, wanted degrees")
-    if transmission not in TRANSMISSIONS:
-        raise RequestError(f"transmission: got {transmission!r}, wanted one of {', '.join(TRANSMISSIONS)}")
+    below, transmission = media.below, media.transmission
     below.check_theory(theory)
-    if transmission != "none" and not below.transparent:
-        raise RequestError(f"transmission: got {transmission!r} with {below}, wanted a transparent medium")
     if profile := is_profile(height_field):
         height_field = HeightField(height_field.heights[:1], height_field.pixel_size, height_field.source)
-    n = 1.0 if transmission == "none" or below.index is None else np.maximum(below.index(wavelengths * 1e-3).real, 1)
+    n = np.maximum(below.index(wavelengths * 1e-3).real, 1) if media.transmits and below.index is not None else 1.0
     # The maximum of |q| is (n_i + n_o)/λ.
     solver = order_solver(theory, height_field, 1e-3 * float(np.min(2 * wavelengths / (1 + n))))
     solve = {"none": solver.reflected, "interface": solver.transmitted, "sheet": solver.through_sheet}[transmission]
@@ -281,19 +277,15 @@ def order_efficiencies(
         np.array(all_orders)[:, 0] if profile else np.array(all_orders),
         angles,
         wavelengths,
-        description(height_field.source, below, azimuth, theory, transmission),
+        description(height_field.source, media, azimuth, theory),
     )
 
 
-def description(
-    source: str, below: MediumBelow, azimuth: float, theory: str = "scalar", transmission: str = "none"
-) -> str:
-    """Return the description of a surface, the medium below it and the theory, as `efficiencies` takes them."""
+def description(source: str, media: Media, azimuth: float, theory: str = "scalar") -> str:
+    """Return the description of a surface in its media, and of the theory."""
     plane = f", plane of incidence at {azimuth:g}°" if azimuth else ""
-    transmitted = {"none": "", "interface": ", transmitted orders inside", "sheet": ", transmitted by a sheet"}[
-        transmission
-    ]
-    return f"{source}; {below}, {theory} theory{transmitted}{plane}"
+    words = {"none": "", "interface": ", transmitted orders inside", "sheet": ", transmitted by a sheet"}
+    return f"{source}; {media.below}, {theory} theory{words[media.transmission]}{plane}"
 
 
 def checked_angles(angles: ArrayLike | str, wavelengths: Real, period: float, azimuth: float | Real) -> Real:

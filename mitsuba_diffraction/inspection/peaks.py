@@ -19,7 +19,7 @@ from scipy.ndimage import gaussian_filter
 from ..array_types import Real
 from ..errors import RequestError
 from ..optics.geometry import fresnel
-from ..optics.media import MediumBelow
+from ..optics.media import Media, MediumBelow
 from ..progress import Progress, silent
 from ..scalar_theory.closed_form import incident_direction, mirrored
 from ..spectrum.grids import OrderGrid
@@ -116,7 +116,7 @@ def efficiencies_of_peaks(
         values[-1, a, w] = polarised[:, ~np.any(regions, axis=0)].sum(axis=1) / albedo
         progress(step, len(angles) * len(wavelengths))
     names = ["mirror", *(f"{sign}{name}" for name in _NAMES[: len(peaks)] for sign in "+-"), "rest"]
-    source = description(spectrum.source, below, azimuth)
+    source = description(spectrum.source, Media(below), azimuth)
     return PeakEfficiencies(values, np.array(names), angles, wavelengths, source, peaks)
 
 

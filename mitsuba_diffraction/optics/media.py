@@ -1,19 +1,24 @@
-"""What lies around a relief."""
+"""What lies around a relief: the media above and below it, a coat, and what becomes of transmitted light."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
 from ..errors import RequestError
-from .materials import KnownRange, RefractiveIndex, index_of, is_file
+from ..settings import TRANSMISSIONS, VISIBLE
+from .materials import KnownRange, RefractiveIndex, constant, index_of, is_file
 
 DEFAULT_INT_IOR = 1.5
 """Index of the dielectric below a relief of which nothing else is said."""
+SAME_INDEX = 1e-3  # indices of refraction that differ by less, as for air and vacuum, are taken as equal
 
 _NAMES = ("material", "int_ior")
+_VACUUM = constant(1.0)
 
 
 @dataclass(frozen=True)
@@ -21,8 +26,9 @@ class MediumBelow:
     """The medium below a relief: a dielectric, a medium that absorbs light, or the perfect mirror.
 
     Attributes:
-        parameter: that names it, "int_ior" or "material", for messages alone.
-        index: n + ik; None of the perfect mirror, R = 1.
+        parameter: that names it, "int_ior" or "material", for messages alone; "eta" of a metal given by two spectra in
+            a scene.
+        index: n + ik; None of the perfect mirror, R = 1, and of two spectra, which may vary over the surface.
     """
 
     parameter: str
@@ -88,6 +94,98 @@ class MediumBelow:
         if self.index is None:
             return "perfect mirror"
         return f"n = {self.index}" if self.index.is_constant else str(self.index)
+
+
+@dataclass(frozen=True)
+class Media:
+    """A surface in its media, but for its films (`film_stack.Stack`), whose thickness may vary.
+
+    Attributes:
+        below: the medium below the relief.
+        above: absolute index of the uppermost medium.
+        coat: absolute index of a clear layer over the relief; None, too, for one of the index of the medium above.
+        transmission: "none", "interface" or "sheet".
+
+    Raises:
+        RequestError: if the index of the coat is below that of the medium above, or there is no transmission.
+    """
+
+    below: MediumBelow
+    above: RefractiveIndex = _VACUUM
+    coat: RefractiveIndex | None = None
+    transmission: str = TRANSMISSIONS[0]
+
+    def __post_init__(self) -> None:
+        if self.transmission not in TRANSMISSIONS:
+            raise RequestError(f"transmission: got {self.transmission!r}, wanted one of {', '.join(TRANSMISSIONS)}")
+        if self.coat is not None:
+            n, above = self.coat.nominal.real, self.above.nominal.real
+            if n < max(1, (1 - SAME_INDEX) * above):
+                raise RequestError(f"coat_ior: got {n:g}, wanted at least one and that of the outside, {above:g}")
+            if n < (1 + SAME_INDEX) * above:
+                object.__setattr__(self, "coat", None)
+        if not self.transmits:
+            return
+        if self.coat is not None:
+            raise RequestError(f"coat_ior: got {self.coat} with transmission={self.transmission}, wanted no coat")
+        if not self.below.transparent:
+            wanted = f"with {self.below}, wanted a transparent medium"
+            raise RequestError(f"transmission: got {self.transmission!r} {wanted}")
+        if abs(self.eta - 1) < SAME_INDEX:
+            wanted = f"that of the outside with transmission={self.transmission}, wanted another one"
+            raise RequestError(f"{self.below.parameter}: got {wanted}")
+
+    @property
+    def transmits(self) -> bool:
+        """Whether transmitted light is followed."""
+        return self.transmission != "none"
+
+    @property
+    def outside(self) -> float:
+        """Absolute index of the uppermost medium; one for air and vacuum."""
+        n = self.above.nominal.real
+        return 1.0 if abs(n - 1) < SAME_INDEX else n
+
+    @property
+    def coat_index(self) -> float:
+        """Index of the coat relative to the medium above, in the middle of visible light; one without a coat."""
+        return 1.0 if self.coat is None else max(self.coat.nominal.real / self.above.nominal.real, 1.0)
+
+    @property
+    def eta(self) -> float:
+        """Index below relative to the uppermost medium, in the middle of visible light."""
+        assert self.below.index is not None
+        return self.below.index.nominal.real / self.above.nominal.real
+
+    @property
+    def index(self) -> float:
+        """The maximum absolute index next to the relief at any visible wavelength, by which wavelengths are divided."""
+        if self.transmits:
+            assert self.below.index is not None
+            return self.outside * max(1.0, self.eta * _rise(self.below.index))
+        return self.outside * self.coat_index * (1.0 if self.coat is None else _rise(self.coat))
+
+    @property
+    def index_name(self) -> str:
+        """The parameter that gives `index`."""
+        if self.coat is not None:
+            return "coat_ior"
+        return self.below.parameter if self.transmits and self.eta > 1 else "ext_ior"
+
+    @property
+    def known(self) -> tuple[KnownRange, ...]:
+        """Where the indices of the medium above and of the coat are known."""
+        coats = () if self.coat is None else (self.coat.known("coat_ior", clear=True),)
+        return self.above.known("ext_ior", clear=True), *coats
+
+    def with_eta(self, eta: float) -> Media:
+        """Return the media with another relative index below, without dispersion."""
+        return replace(self, below=replace(self.below, index=constant(eta * self.above.nominal.real)))
+
+
+def _rise(medium: RefractiveIndex) -> float:
+    """Return the maximum index of a medium at visible wavelengths relative to its nominal one."""
+    return float(medium(np.linspace(*VISIBLE, 100) * 1e-3).real.max() / medium.nominal.real)
 
 
 def index_files(parameters: Mapping[str, Any]) -> dict[str, Path]:

@@ -10,8 +10,9 @@ from pathlib import Path
 from typing import Any
 
 from ..errors import RequestError, did_you_mean
+from ..optics.media import Media, MediumBelow
 from ..progress import Progress, no_progress, say
-from ..settings import SPECTRUM_PARAMETERS, ScalarSettings, Settings
+from ..settings import SPECTRUM_PARAMETERS, TRANSMISSIONS, ScalarSettings, Settings
 from ..surface.gratings import RENAMED
 from ..surface.heightfield import HeightField
 from ..surface.prepare import repeats_without_seam
@@ -154,6 +155,29 @@ class RequestedSurface:
         if self.kind == "spectrum":
             return "rigorous" if is_rigorous(self.source) else "scalar"
         return self.stated.settings.theory
+
+    @property
+    def _of_recipe(self) -> Mapping[str, Any]:
+        """What its recipe says of its media, among other parameters."""
+        return {} if self.is_spectrum else self.stated.settings.chosen
+
+    @property
+    def below(self) -> MediumBelow:
+        """The medium below, for orders in air.
+
+        Raises:
+            RequestError: as `MediumBelow.of`, or if the surface lies below another medium than air.
+        """
+        outside = {**self._of_recipe, **self.aside}.get("ext_ior", 1)
+        if outside != 1:
+            raise RequestError(f"ext_ior: got {outside} of the recipe, wanted none: these orders are in air")
+        return MediumBelow.requested(self.aside, self._of_recipe)
+
+    @property
+    def media(self) -> Media:
+        """It in air, with the light that it transmits; for errors see `below` and `Media`."""
+        kind = {**self._of_recipe, **self.aside}.get("transmission", TRANSMISSIONS[0])
+        return Media(self.below, transmission=kind)
 
     @property
     def is_irregular(self) -> bool:
