@@ -4,10 +4,8 @@ from __future__ import annotations
 
 import inspect
 import math
-import os
 from collections.abc import Callable
 from dataclasses import dataclass, fields
-from pathlib import Path
 from statistics import NormalDist
 from typing import Any, ClassVar
 
@@ -313,18 +311,3 @@ def matching(q: ArrayLike, kappa: ArrayLike) -> tuple[NDArray[np.float64], NDArr
             f"kappa: got shape {kappa.shape}, which does not broadcast with q of shape {q.shape}"
         ) from None
     return np.broadcast_to(q, (*shape, 2)), np.broadcast_to(kappa, shape)
-
-
-def usable_cores() -> int:
-    """Return the number of threads that compute at once: of the cores of this process at most eight, for the memory."""
-    affinity = getattr(os, "sched_getaffinity", None)
-    return min(len(affinity(0)) if affinity else os.cpu_count() or 1, 8)
-
-
-def available_memory() -> int | None:
-    """Return the number of bytes that processes can allocate, swap included; None if unknown."""
-    try:
-        entries = dict(line.split(":") for line in Path("/proc/meminfo").read_text("ascii").splitlines())
-        return 1024 * sum(int(entries[name].split()[0]) for name in ("MemAvailable", "SwapFree"))
-    except (OSError, KeyError, ValueError):
-        return None

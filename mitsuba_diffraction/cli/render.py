@@ -14,6 +14,7 @@ import typer
 
 from ..errors import RequestError
 from ..files.outputs import check_outputs, free_name
+from ..machine import available_memory
 from ..progress import bytes_text, durations, progress_bar, say, stage, takes_long, tell, time_text
 from .arguments import Define, Overwrite, Variant, check_suffix, materials_of, named_as_options, scene_parameters
 
@@ -27,6 +28,7 @@ if TYPE_CHECKING:
 
 _log = logging.getLogger(__name__)
 MIN_WARNED_SECONDS = 3600
+_MIN_MEMORY = 400_000_000  # bytes, of Mitsuba and its compiler, without which they end in crashes
 
 
 class Stopped(Exception):
@@ -117,6 +119,11 @@ def render(
         shown = neutral_view if view is None else ocio_view(view)
     if orbit and frames is None:
         raise RequestError("--orbit: wanted --frames N with it")
+
+    if (available := available_memory()) is not None and available < _MIN_MEMORY:
+        raise RequestError(
+            f"memory: got {bytes_text(available)} that are available, wanted at least {bytes_text(_MIN_MEMORY)}"
+        )
 
     import mitsuba as mi
 

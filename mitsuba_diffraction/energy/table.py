@@ -50,8 +50,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..errors import RequestError
+from ..machine import usable_cores
 from ..optics.film_stack import MAX_PHASE_STEP, Stack
-from ..settings import usable_cores
 from ..spectrum.grids import OrderGrid
 from ..spectrum.power_spectrum import PowerSpectrum
 from .furnace import MAX_E, Furnace, Real

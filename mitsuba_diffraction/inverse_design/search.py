@@ -14,9 +14,10 @@ from numpy.typing import ArrayLike, NDArray
 
 from ..array_types import Real
 from ..errors import RequestError, check_whole
+from ..machine import available_memory
 from ..progress import Progress, bytes_text, silent
 from ..rigorous.solver import one_thread
-from ..settings import MIN_WAVELENGTH, available_memory
+from ..settings import MIN_WAVELENGTH
 from .colour_distance import ColourDistance
 from .far_field import FarField, lobes_in_bins, nearest_levels
 from .plate import Plate

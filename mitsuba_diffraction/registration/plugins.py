@@ -14,6 +14,7 @@ import importlib
 import drjit as dr
 import mitsuba as mi
 
+from ..machine import allowed_cores
 from ..variants import is_supported, llvm_problem
 from .wrapped_functions import classes, making, wrap_functions
 
@@ -57,8 +58,9 @@ def _refuse(reason: str, props: mi.Properties) -> mi.Object:
 if not getattr(mi, "_mitsuba_diffraction_registered", False):
     wrap_functions([name for name, *_ in PLUGINS])
     mi._mitsuba_diffraction_registered = True
-    # With one thread, on a machine of one core, Mitsuba 3.9.1 hangs when it reads or writes an EXR picture.
-    if dr.thread_count() < 2:
-        dr.set_thread_count(2)
+    # A container may allow fewer cores than Dr.Jit sees. With one thread, Mitsuba 3.9.1 hangs when it reads or writes
+    # an EXR picture.
+    if (threads := max(2, min(dr.thread_count(), allowed_cores()))) != dr.thread_count():
+        dr.set_thread_count(threads)
 if mi.variant() is not None:
     register_plugins(mi.variant())

@@ -49,7 +49,7 @@ _RESERVED = frozenset(
 
 
 _JPEG_QUALITY = 95
-PIXELS_PER_BLOCK = 2**17
+PIXELS_PER_BLOCK = 2**15
 
 
 def split_rows(rows: int, columns: int) -> list[slice]:

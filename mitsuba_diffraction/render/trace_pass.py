@@ -27,8 +27,8 @@ from ..bsdf.device_tables import on_device
 from ..bsdf.light import recorded_wavelengths
 from ..errors import RequestError, root_cause
 from ..integrator.paths import LightPaths, random_numbers, unpacked
+from ..machine import available_memory
 from ..progress import bytes_text
-from ..settings import available_memory
 from .scene import no_warnings, recorded_range
 from .spectral_film import channel_wavelengths, channel_weights
 
@@ -37,6 +37,8 @@ Rows = tuple[int, int]
 
 # A band of this many pixels, 1024 × 768, takes up to 1.3 GB.
 BAND_PIXELS = 3 * 2**18
+# Kernels, preview and the file of a picture, in addition to what grows with its size.
+_FURTHER_BYTES = 150_000_000
 _GROUP = 4  # neighbouring pixels of which `collect` gathers the samples at once
 _SPOOLED_BYTES = 2**22  # in memory for each band
 
@@ -115,7 +117,7 @@ def needs_mitsubas_film(integrator: mi.Integrator) -> bool:
 
 
 def check_memory(scene: mi.Scene, spp: int, bands: tuple[Rows, ...] | None = None) -> int:
-    """Check that a picture fits into the available memory, where the system reports it (Linux); return what it needs.
+    """Check that a picture fits into the available memory, where the system reports it (Linux); return what it takes.
 
     The peak memory has three parts: 8 n + 84 bytes per pixel of a band with n channels (the sums and the result of a
     pass in float32, and its luminance), 40 bytes per sample of a pass of the band (position on the film, channels and
@@ -135,9 +137,10 @@ def check_memory(scene: mi.Scene, spp: int, bands: tuple[Rows, ...] | None = Non
     pixel_bytes, sample_bytes = (14 * n, 24 * n) if needs_mitsubas_film(scene.integrator()) else (8 * n + 84, 40)
     needed = columns * (largest * (pixel_bytes + sample_bytes * spp) + 8 * rows)
     dr.flush_malloc_cache()
-    if (available := available_memory()) is not None and needed > available:
+    if (available := available_memory()) is not None and needed + _FURTHER_BYTES > available:
         raise RequestError(
-            f"film: got {columns} × {rows} pixels, which take {bytes_text(needed)} of memory, wanted at most the "
+            f"film: got {columns} × {rows} pixels, which take {bytes_text(needed)} of memory beside the "
+            f"{bytes_text(_FURTHER_BYTES)} of any picture, wanted at most the "
             f"{bytes_text(available)} that are available"
         )
     return needed

@@ -21,9 +21,10 @@ from numpy.typing import NDArray
 from ..array_types import Real
 from ..errors import RequestError
 from ..files.writing import whole_file
+from ..machine import usable_cores
 from ..optics.media import MediumBelow
 from ..progress import Progress, silent, stage
-from ..settings import RigorousSettings, usable_cores
+from ..settings import RigorousSettings
 from ..surface.heightfield import HeightField
 from .coordinate_transformation import (
     ABOVE,

@@ -12,7 +12,7 @@ import scipy.fft
 import scipy.linalg
 from numpy.typing import NDArray
 
-from ..settings import usable_cores
+from ..machine import usable_cores
 from ..surface.heightfield import HeightField
 from .grids import SHIFTS, OrderGrid, SplineGrid, inner, spline
 from .tables import derivative_bound
