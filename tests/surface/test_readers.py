@@ -922,8 +922,9 @@ def test_cells_that_are_no_pixels_are_not_missing(tmp_path, refuse):
     )
     (tmp_path / "scan.csv").write_text(",0,0.1,0.2\n0,1,2,3\n0.1,4,5,7\n0.2,1,1,2\n")
     refuse("scan.csv", "the first line and column may be coordinates", unit="um")
-    (tmp_path / "scan.csv").write_text("1,,2\n3,four,5\n")
-    refuse("scan.csv", "not a table of numbers", unit="um")
+    for text in ("1,,2\n3,four,5\n", ",\n", " ;\n;\n", "\t;", "x,y,z\n,,\n"):
+        (tmp_path / "scan.csv").write_text(text)
+        refuse("scan.csv", "not a table of numbers", unit="um")
 
 
 @pytest.mark.parametrize("encoding", ["utf-16", "utf-16-le", "utf-16-be", "utf-8-sig"])

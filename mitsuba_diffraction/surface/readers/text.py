@@ -285,6 +285,8 @@ def _with_empty_cells(text: str, delimiter: str) -> NDArray[np.float64]:
     lines = [line for line in (line.partition("#")[0] for line in text.splitlines()) if line.strip()]
     table = np.array([[float(cell) if cell.strip() else np.nan for cell in line.split(delimiter)] for line in lines])
     rows, columns = (np.flatnonzero(~np.isnan(table).all(axis=axis)) for axis in (1, 0))
+    if not rows.size:
+        raise RequestError("no numbers")
     table = table[rows[0] : rows[-1] + 1, columns[0] : columns[-1] + 1]
     if delimiter == "\t" and len(columns) < table.shape[1]:
         raise RequestError("tabs that align numbers")
