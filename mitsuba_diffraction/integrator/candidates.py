@@ -36,6 +36,7 @@ from ..bsdf.device_tables import BELOW_ONE, on_device, opaque
 from ..precomputation.grating_spectrum import GratingSpectrum
 from ..precomputation.spectra import Spectrum
 from ..spectrum.grids import OrderGrid
+from .scene_cache import SceneCache
 from .unshadowed_light import UnshadowedLight
 
 CANDIDATES, LATER_CANDIDATES = 16, 8  # M, at the first vertex that scatters, and at later ones, which have J = 1
@@ -82,7 +83,12 @@ class Candidates:
     """
 
     def __init__(
-        self, scene: mi.Scene, emitters: MetEmitters, shapes: list[mi.Shape], instanced: list[mi.Shape]
+        self,
+        scene: mi.Scene,
+        emitters: MetEmitters,
+        shapes: list[mi.Shape],
+        instanced: list[mi.Shape],
+        cache: SceneCache,
     ) -> None:
         """Choose J of all gratings.
 
@@ -91,12 +97,11 @@ class Candidates:
             emitters: of the scene.
             shapes: on which points can be drawn.
             instanced: of groups, whose instances are in the scene.
+            cache: of this scene.
         """
-        self.emitters, self.light = emitters, UnshadowedLight(scene)
-        u = _random(0)
-        points = {shape: shape.sample_position(0.0, mi.Point2f(u.x, u.y)).p for shape in shapes}
-        points |= dict.fromkeys(instanced, _points_of_instances(scene, u) if instanced else None)
-        slots = {shape: self._slots(scene, shape, on_shape) for shape, on_shape in points.items()}
+        self.emitters, self.light = emitters, cache.once("light", lambda: UnshadowedLight(scene))
+        numbers = cache.once("slots", lambda: self._numbers_of_slots(scene, shapes, instanced))
+        slots = dict(zip((*shapes, *instanced), numbers, strict=True))
         shapes = [shape for shape in slots if slots[shape]]
         self.any = bool(shapes)
         self._bsdfs: list[mi.BSDF] = []
@@ -111,6 +116,13 @@ class Candidates:
             table[row] = slots[shape], next(k for k, known in enumerate(self._bsdfs) if bsdf is known)
         self._table = on_device(table, mi.UInt32)
         self._fraction = opaque(DEFENSIVE_FRACTION)
+
+    def _numbers_of_slots(self, scene: mi.Scene, shapes: list[mi.Shape], instanced: list[mi.Shape]) -> list[int]:
+        """Return J of each shape."""
+        u = _random(0)
+        points = {shape: shape.sample_position(0.0, mi.Point2f(u.x, u.y)).p for shape in shapes}
+        points |= dict.fromkeys(instanced, _points_of_instances(scene, u) if instanced else None)
+        return [self._slots(scene, shape, on_shape) for shape, on_shape in points.items()]
 
     def _slots(self, scene: mi.Scene, shape: mi.Shape, points: mi.Point3f) -> int:
         """Return J of a shape with these points, zero where lights are about as bright in all directions."""

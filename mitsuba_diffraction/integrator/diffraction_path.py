@@ -12,6 +12,7 @@ from ..bsdf.light import is_black, recorded_wavelengths
 from ..errors import RequestError
 from ..parameter_documentation import Parameter, listed
 from .paths import Gratings, LightPaths, define_eye_paths, implements, unpacked
+from .scene_cache import SceneCache
 
 PARAMETERS = (
     Parameter("max_depth", "integer", "as in `path`: 2 is direct light, 3 a rainbow on a wall; −1 is no limit", "−1"),
@@ -80,19 +81,23 @@ def define() -> type:
             if props.get("hide_emitters", False):
                 raise RequestError("hide_emitters: got true, wanted false: diffraction_path shows all lights")
             self.path = nested_plugin("path", max_depth=self.max_depth, rr_depth=self.rr_depth)
+            self.cache = SceneCache()
 
         def parts(self, scene: mi.Scene, sensor: mi.Sensor) -> tuple[mi.SamplingIntegrator, LightPaths | None]:
             """Return the tracers of paths from the eye and from the light; None for the light without such paths."""
-            gratings = _lit_gratings(scene, sensor, self.max_depth)
+            cache = self.cache
+            cache.follow(scene, sensor)
+            gratings = _lit_gratings(scene, sensor, self.max_depth, cache)
             if gratings is None:
                 return self.path, None
-            eye = eye_class(scene, sensor, gratings, self.max_depth, self.rr_depth)
+            eye = eye_class(scene, sensor, gratings, cache, self.max_depth, self.rr_depth)
             if 0 <= self.max_depth < 3 or not gratings.shapes:
                 return (eye if eye.candidates.any or eye.lamps.any else self.path), None
             recorded = recorded_wavelengths(sensor.film())
-            if all(shape in gratings or is_black(shape.bsdf(), *recorded) for shape in scene.shapes()):
+            others = [shape for shape in scene.shapes() if shape not in gratings]
+            if cache.once("all black", lambda: all(is_black(shape.bsdf(), *recorded) for shape in others)):
                 return eye, None
-            return eye, LightPaths(scene, sensor, gratings, self.max_depth, self.rr_depth)
+            return eye, LightPaths(scene, sensor, gratings, cache, self.max_depth, self.rr_depth)
 
         def sample(
             self,
@@ -154,7 +159,7 @@ def define() -> type:
     return DiffractionPath
 
 
-def _lit_gratings(scene: mi.Scene, sensor: mi.Sensor, max_depth: int) -> Gratings | None:
+def _lit_gratings(scene: mi.Scene, sensor: mi.Sensor, max_depth: int, cache: SceneCache) -> Gratings | None:
     """Return the gratings from which light is traced; None if all paths are traced as in `path`.
 
     Raises:
@@ -165,7 +170,7 @@ def _lit_gratings(scene: mi.Scene, sensor: mi.Sensor, max_depth: int) -> Grating
     # Points of the scene can be connected to `perspective` and `thinlens`.
     if not implements(sensor.sample_direction, dr.zeros(mi.SurfaceInteraction3f), mi.Point2f(0.5)):
         return None
-    gratings = Gratings(scene)
+    gratings = Gratings(scene, cache)
     if not (gratings.shapes or gratings.instanced) or not scene.emitters():
         return None
     film = sensor.film()

@@ -24,6 +24,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..bsdf.device_tables import BELOW_ONE, on_device, opaque, smaller
+from .scene_cache import SceneCache
 
 _PACKETS = 4  # K/4
 
@@ -35,11 +36,12 @@ class LampsWithoutExtent:
         any: whether the scene draws any.
     """
 
-    def __init__(self, scene: mi.Scene, sensor: mi.Sensor) -> None:
+    def __init__(self, scene: mi.Scene, sensor: mi.Sensor, cache: SceneCache) -> None:
         flags = np.array([emitter.flags() for emitter in scene.emitters()])
         # Light samples do not find a surface that emits in one direction, `directionalarea`.
         is_lamp = (flags & +mi.EmitterFlags.Delta > 0) & (flags & +mi.EmitterFlags.Surface == 0)
-        self._lamps, self._others = Emitters(scene, is_lamp), Emitters(scene, ~is_lamp)
+        self._lamps = cache.once("lamps without extent", lambda: Emitters(scene, is_lamp))
+        self._others = cache.once("other emitters", lambda: Emitters(scene, ~is_lamp))
         self.sensor, self.any = sensor, self._lamps.any
 
     @dr.syntax

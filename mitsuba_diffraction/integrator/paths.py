@@ -18,6 +18,7 @@ from ..bsdf.base import gratings_in, is_grating, parts
 from ..bsdf.device_tables import on_device
 from .candidates import Candidates, MetEmitters
 from .lamps_without_extent import LampsWithoutExtent
+from .scene_cache import SceneCache
 
 
 def quotient(a: mi.Float, b: mi.Float) -> mi.Float:
@@ -61,18 +62,16 @@ class Gratings:
         has_mixture: whether a BSDF that transmits light holds others than gratings.
     """
 
-    def __init__(self, scene: mi.Scene) -> None:
-        areas = [(shape, _area(shape)) for shape in scene.shapes() if gratings_in(shape.bsdf())]
-        areas = [(shape, area) for shape, area in areas if area > 0]
-        is_found = _are_found(scene, [shape for shape, _ in areas])
-        areas = [one for one, found in zip(areas, is_found, strict=True) if found]
-        self.shapes = [shape for shape, _ in areas]
+    def __init__(self, scene: mi.Scene, cache: SceneCache) -> None:
+        shapes = [shape for shape in scene.shapes() if gratings_in(shape.bsdf())]
+        areas = cache.once("areas", lambda: _areas(scene, shapes))
+        self.shapes = [shape for shape, area in zip(shapes, areas, strict=True) if area > 0]
         has_instances = any(shape.class_name() == "Instance" for shape in scene.shapes())
         groups = [shape for shape in parts(scene, mi.Shape) if shape.class_name() == "ShapeGroupPlugin"]
         members = [shape for group in groups for shape in parts(group, mi.Shape) if has_instances]
         self.instanced = [shape for shape in members if gratings_in(shape.bsdf())]
         if self.shapes:
-            self._choice = mi.DiscreteDistribution([area for _, area in areas])
+            self._choice = mi.DiscreteDistribution([area for area in areas if area > 0])
         others = [bsdf for shape in self.shapes if not _is_grating_only(bsdf := shape.bsdf())]
         self.has_mixture = any(bsdf.flags() & +mi.BSDFFlags.GlossyTransmission for bsdf in others)
         ids = [dr.reinterpret_array(mi.UInt32, mi.ShapePtr(shape))[0] for shape in (*self.shapes, *self.instanced)]
@@ -132,6 +131,13 @@ def implements(method: Callable[..., object], *arguments: object) -> bool:
     return True
 
 
+def _areas(scene: mi.Scene, shapes: list[mi.Shape]) -> list[float]:
+    """Return the area of each shape, zero where Mitsuba cannot draw points or rays do not find them."""
+    areas = [_area(shape) for shape in shapes]
+    found = iter(_are_found(scene, [shape for shape, area in zip(shapes, areas, strict=True) if area > 0]))
+    return [area if area > 0 and next(found) else 0.0 for area in areas]
+
+
 def _area(shape: mi.Shape) -> float:
     """Return the area of a shape, zero if Mitsuba cannot draw points on it."""
     if not (implements(shape.sample_position, 0.0, mi.Point2f(0.5)) and implements(shape.surface_area)):
@@ -182,13 +188,19 @@ def define_eye_paths() -> type:
         """Mitsuba's `path` without the paths that are traced from the light (see `diffraction_path`)."""
 
         def __init__(
-            self, scene: mi.Scene, sensor: mi.Sensor, gratings: Gratings, max_depth: int, rr_depth: int
+            self,
+            scene: mi.Scene,
+            sensor: mi.Sensor,
+            gratings: Gratings,
+            cache: SceneCache,
+            max_depth: int,
+            rr_depth: int,
         ) -> None:
             mi.SamplingIntegrator.__init__(self, mi.Properties("eye_paths"))
             self.gratings = gratings
             self.emitters = MetEmitters(scene)
-            self.candidates = Candidates(scene, self.emitters, gratings.shapes, gratings.instanced)
-            self.lamps = LampsWithoutExtent(scene, sensor)
+            self.candidates = Candidates(scene, self.emitters, gratings.shapes, gratings.instanced, cache)
+            self.lamps = LampsWithoutExtent(scene, sensor, cache)
             # Whether L G X G E and L G X M E are short enough: a literal, which removes what serves them alone.
             self.guides = bool(gratings.shapes) and not 0 <= max_depth < 4
             # Opaque, so that all depths run the same kernel.
@@ -461,14 +473,22 @@ class LightPaths:
     mean of direct light over the film, plus that of the pilot. Thus r depends on the scene alone.
     """
 
-    def __init__(self, scene: mi.Scene, sensor: mi.Sensor, gratings: Gratings, max_depth: int, rr_depth: int) -> None:
+    def __init__(
+        self,
+        scene: mi.Scene,
+        sensor: mi.Sensor,
+        gratings: Gratings,
+        cache: SceneCache,
+        max_depth: int,
+        rr_depth: int,
+    ) -> None:
         self.scene, self.sensor, self.gratings = scene, sensor, gratings
         # Opaque, so that all depths run the same kernel.
         self.max_depth = dr.opaque(mi.UInt32, max_depth % 2**32)
         self.pixels = math.prod(map(int, sensor.film().crop_size()))
         self.rr_depth = dr.opaque(mi.UInt32, rr_depth)
         self._capacity = float(_BRANCHES)  # contributions that a buffer takes, per start
-        self.per_sample = self._number_per_sample()
+        self.per_sample = cache.once("light paths", self._number_per_sample)
 
     def count(self, spp: int) -> int:
         """Return the number of paths for `spp` samples per pixel."""

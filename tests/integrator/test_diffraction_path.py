@@ -11,6 +11,7 @@ from bsdf_support import bitmap, grating, uniform, use
 
 import mitsuba_diffraction  # noqa: F401 (settles which LLVM is used before a variant is set)
 from mitsuba_diffraction.integrator.paths import Gratings, LightPaths, SplatBuffer, _power_heuristic
+from mitsuba_diffraction.integrator.scene_cache import SceneCache
 from mitsuba_diffraction.render import scene_file
 from mitsuba_diffraction.render.scene_file import SceneFile
 from mitsuba_diffraction.render.spectral_film import channel_weights
@@ -346,7 +347,7 @@ def test_buffers_of_later_launches_are_large_enough_at_once(llvm, monkeypatch):
 )
 def test_points_are_drawn_on_shapes_only_where_rays_find_them(kind, transform, is_drawn_on, llvm):
     shape = {"type": kind, "to_world": transform(), "bsdf": blaze()}
-    assert len(Gratings(mi.load_dict({"type": "scene", "shape": shape})).shapes) == is_drawn_on
+    assert len(Gratings(mi.load_dict({"type": "scene", "shape": shape}), SceneCache()).shapes) == is_drawn_on
 
 
 def beam_on_a_grating():

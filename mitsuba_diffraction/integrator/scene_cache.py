@@ -1,0 +1,45 @@
+"""What tracing needs of a scene besides its objects: made once, and again when the scene has changed."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any, TypeVar, cast
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+
+Made = TypeVar("Made")
+
+
+class SceneCache:
+    """Numbers and arrays that follow from the parameters of a scene and its sensor.
+
+    A parameter has changed if it is another array of Dr.Jit. The arrays are held, so that no other gets their index,
+    and operations in place make copies. What is made must not hold the scene, its shapes or BSDFs: it is kept by the
+    integrator, which the scene holds.
+    """
+
+    def __init__(self) -> None:
+        self._held: list[Any] = []
+        self._state: list[Any] = []
+        self._made: dict[str, Any] = {}
+
+    def follow(self, scene: mi.Scene, sensor: mi.Sensor) -> None:
+        """Forget what was made if the scene or the sensor is another or has changed."""
+        parameters = [item for of in (scene, sensor) for item in mi.traverse(of).items()]
+        state = [(name, _identity(value)) for name, value in parameters]
+        if state != self._state:
+            # Copies, as what `traverse` returns refers to the scene, and changes with it.
+            self._held, self._state, self._made = [dr.copy(dr.detach(value)) for _, value in parameters], state, {}
+
+    def once(self, name: str, make: Callable[[], Made]) -> Made:
+        """Return what a function makes of the scene, which it is called for only if it has not been."""
+        if name not in self._made:
+            self._made[name] = make()
+        return cast(Made, self._made[name])
+
+
+def _identity(value: Any) -> Any:
+    """Return the indices of the arrays in a parameter, or its numbers."""
+    return dr.detail.collect_indices(value) or (np.array(value).tolist() if dr.is_array_v(value) else value)
