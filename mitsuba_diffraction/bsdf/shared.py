@@ -95,11 +95,11 @@ class SharedTables:
         """
         spectrum, (low, high) = self._spectrum, scales.ratios()
         per_step = spectrum.max_kappa * spectrum.height_range / MAX_NODE_PHASE_STEP
-        if low == high and any(not scale.varies and dr.grad_enabled(scale.value) for scale in scales):
-            # Wide enough for differences of values that are stored as bytes.
-            half = 1 / max(per_step, 10)
-            low, high = max(low - half, 0.0), low + half
         count = 1 if low == high else int(np.clip(np.ceil((high - low) * per_step), 1, MAX_RATIOS - 1)) + 1
+        if low == high and any(not scale.varies and dr.grad_enabled(scale.value) for scale in scales):
+            # In the middle of two nodes the slope is a central difference. Values are stored as bytes: wide enough.
+            half = 1 / max(per_step, 10)
+            low, high, count = max(low - half, 0.0), low + half, 2
         key = np.linspace(low, high, count).tolist(), scales.laterals
         with self._lock:
             if self._energy is None or self._energy[0] != key:
