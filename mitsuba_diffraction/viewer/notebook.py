@@ -11,7 +11,7 @@ from ..errors import RequestError
 from ..precomputation.grating_spectrum import GratingSpectrum
 from ..precomputation.recipe import Recipe
 from .page import page
-from .viewed_surface import Surface, material_from
+from .viewed_surface import Surface, in_scene
 
 
 class View:
@@ -48,7 +48,7 @@ def _surface(surface: object, parameters: Mapping[str, Any]) -> Surface:
     if isinstance(surface, GratingSpectrum):
         file = {"filename": "surface.exr"}
         return Surface(
-            "surface", surface, None, file, material_from(parameters), '# in Python: spectrum.save("surface.exr")'
+            "surface", surface, None, file, in_scene(parameters), '# in Python: spectrum.save("surface.exr")'
         )
     if isinstance(surface, Recipe):
         name = str(surface.surface.get("profile") or surface.surface.get("scan"))

@@ -17,6 +17,7 @@ from ..errors import RequestError
 from ..files.outputs import MARK
 from ..optics.color import observer
 from ..optics.materials import conductor
+from ..optics.media import DEFAULT_INT_IOR, MediumBelow
 from ..settings import FROM_RADIUS, SUN_COHERENCE_LENGTH, VISIBLE
 from ..spectrum.grids import OrderGrid
 from ..spectrum.sample import effective_coherence_length, window_axes
@@ -126,7 +127,7 @@ def _data(surface: Surface, picture: NDArray[np.float16] | None) -> dict[str, An
         "command": surface.command,
         "material": _material(surface),
         "spectrum": _spectrum(surface),
-        "metals": _metals(surface.material.material),
+        "metals": _metals(surface.in_scene.media.below),
         "light": encoded(_light()),
         "coil": coil(),
         "scales": "elaphe" if "elaphe" in surface.spectrum.source else "xenopeltis",
@@ -149,7 +150,7 @@ def _shape(surface: Surface) -> str:
         return "disc"
     if DESIGN in surface.spectrum.source:
         return "wall"
-    if surface.material.orientation in FROM_RADIUS:
+    if surface.in_scene.orientation in FROM_RADIUS:
         return "plate"
     return "coil" if surface.spectrum.extent == "sample" or _profile(surface) in _SKINS else "sphere"
 
@@ -159,13 +160,23 @@ def _profile(surface: Surface) -> str:
 
 
 def _material(surface: Surface) -> dict[str, Any]:
-    orientation = surface.material.orientation
-    return vars(surface.material) | {
+    shown = surface.in_scene
+    orientation, below = shown.orientation, shown.media.below
+    return {
+        "int_ior": below.index.nominal.real if below.transparent and below.index else DEFAULT_INT_IOR,
+        "material": _metal(below),
+        "coat_ior": shown.coat_ior,
+        "height_scale": shown.height_scale,
         "air": AIR,
         "orientation": FROM_RADIUS.get(orientation, orientation) if isinstance(orientation, str) else orientation,
         "from_radius": orientation in FROM_RADIUS,
         "max_height_scale": surface.max_height_scale,
     }
+
+
+def _metal(below: MediumBelow) -> str:
+    """Return the name of a metal, "none" of the perfect mirror, or "" of a dielectric."""
+    return "none" if below.index is None else "" if below.transparent else str(below.index)
 
 
 def _spectrum(surface: Surface) -> dict[str, Any]:
@@ -250,11 +261,13 @@ def _light() -> NDArray[np.float32]:
     return np.column_stack([matching, light / (light @ matching[:, 1])]).astype(np.float32)
 
 
-def _metals(chosen: str) -> dict[str, Any]:
+def _metals(below: MediumBelow) -> dict[str, Any]:
     """Return n + ik of the conductors at each nm, (471, 2), as `Conductor` of the BSDF has them."""
-    names = [*METALS, *([chosen] if chosen not in (*METALS, "", "none") else [])]
+    metals = {name: conductor(name) for name in METALS}
+    if below.index is not None and not below.transparent:
+        metals |= {_metal(below): below.index}
     found = {}
-    for name in names:
-        index = conductor(name)(_nanometres() * 1e-3)
+    for name, medium in metals.items():
+        index = medium(_nanometres() * 1e-3)
         found[name] = encoded(np.stack([index.real, index.imag], -1).astype(np.float32))
     return found

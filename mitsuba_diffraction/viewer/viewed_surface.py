@@ -5,15 +5,15 @@ from __future__ import annotations
 import os
 from collections.abc import Callable, Mapping
 from contextlib import AbstractContextManager
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
 
 from ..errors import RequestError, did_you_mean, is_number, operand, shell_command
 from ..files.writing import examples_folder
-from ..optics.materials import refractive_index
-from ..optics.media import DEFAULT_INT_IOR
+from ..optics.materials import constant
+from ..optics.media import DEFAULT_INT_IOR, Media, MediumBelow
 from ..precomputation.grating_spectrum import GratingSpectrum
 from ..precomputation.recipe import Recipe, parameters_of_profile
 from ..precomputation.requested_surface import RequestedSurface
@@ -41,37 +41,29 @@ DISCS = ("compact_disc", "dvd")
 
 
 @dataclass(frozen=True)
-class ViewedMaterial:
-    """What the grating is made of, as in a scene.
+class InScene:
+    """What a scene says of a grating that a page shows.
 
     Attributes:
-        int_ior: index of refraction of a dielectric.
-        material: or a conductor by Mitsuba's name, or "none", the perfect mirror.
+        media: around it, in air.
         orientation: degrees from the tangent to the pattern's x axis; or radial or tangential.
         height_scale: factor of the heights.
-        coat_ior: index of a clear layer over the grating; one of none.
     """
 
-    int_ior: float = DEFAULT_INT_IOR
-    material: str = ""
-    orientation: float | str = 0.0
-    height_scale: float = 1.0
-    coat_ior: float = 1.0
+    media: Media
+    orientation: float | str
+    height_scale: float
 
     def __post_init__(self) -> None:
-        for name in ("int_ior", "height_scale", "coat_ior"):
-            if not is_number(value := getattr(self, name)):
-                raise RequestError(f"{name}: got {value!r}, wanted a number")
         if self.orientation not in tuple(FROM_RADIUS) and not is_number(self.orientation):
             raise RequestError(f"orientation: got {self.orientation!r}, wanted degrees, radial or tangential")
-        if not 1 < self.int_ior <= 10:
-            raise RequestError(f"int_ior: got {self.int_ior!r}, wanted an index above 1, at most 10")
-        if not 1 <= self.coat_ior <= 10:
-            raise RequestError(f"coat_ior: got {self.coat_ior!r}, wanted an index of 1 (no layer) to 10")
-        if not self.height_scale >= 0:
+        if not (is_number(self.height_scale) and self.height_scale >= 0):
             raise RequestError(f"height_scale: got {self.height_scale!r}, wanted a number ≥ 0")
-        if self.material not in ("", "none"):
-            refractive_index(0.55, material=self.material)  # refuses unknown names
+
+    @property
+    def coat_ior(self) -> float:
+        """Index of the layer over the grating; one of none."""
+        return 1.0 if self.media.coat is None else self.media.coat.nominal.real
 
 
 @dataclass(frozen=True, eq=False)
@@ -83,7 +75,7 @@ class Surface:
         spectrum: S(q; κ) as slices.
         recipe: of the heights; None for a saved spectrum.
         grating: the surface as parameters of `diffraction_grating`; files by their names, without folders.
-        material: its material.
+        in_scene: its media and scales.
         command: that makes the file of `grating`, if it is not there yet.
     """
 
@@ -91,7 +83,7 @@ class Surface:
     spectrum: GratingSpectrum
     recipe: Recipe | None
     grating: Mapping[str, str | int | float]
-    material: ViewedMaterial
+    in_scene: InScene
     command: str = ""
 
     def __post_init__(self) -> None:
@@ -107,22 +99,22 @@ class Surface:
                 f"{self.name}: got a table of {columns} × {rows} nodes and {spectrum.table.intervals} intervals of κ, "
                 f"wanted at most {MAX_SIDE} × {MAX_SIDE} and {MAX_LAYERS}, the textures of WebGL2"
             )
-        coat, shortest = self.material.coat_ior, spectrum.wavelengths[0]
+        coat, shortest = self.in_scene.coat_ior, spectrum.wavelengths[0]
         if coat > 1 and coat / AIR * shortest > SHORTEST * (1 + 1e-6):
             raise RequestError(
                 f"coat_ior: got {coat:g}, wanted at most {max(1, AIR * SHORTEST / shortest):.4g}: the spectrum was "
                 f"built for wavelengths from {shortest:g} nm; give the page a recipe or a profile"
             )
-        if self.material.height_scale > (max_scale := self.max_height_scale) * (1 + 1e-6):
+        if self.in_scene.height_scale > (max_scale := self.max_height_scale) * (1 + 1e-6):
             raise RequestError(
-                f"height_scale: got {self.material.height_scale:g}, wanted at most {max_scale:.4g}: the spectrum was "
+                f"height_scale: got {self.in_scene.height_scale:g}, wanted at most {max_scale:.4g}: the spectrum was "
                 f"built for wavelengths from {spectrum.wavelengths[0]:g} nm"
             )
 
     @property
     def max_height_scale(self) -> float:
         """The largest factor of the heights that the table covers for visible light."""
-        return max(1.0, SHORTEST / max(1.0, self.material.coat_ior / AIR) / self.spectrum.wavelengths[0])
+        return max(1.0, SHORTEST / self.in_scene.media.coat_index / self.spectrum.wavelengths[0])
 
     @classmethod
     def of_recipe(
@@ -144,17 +136,17 @@ class Surface:
             progress: of the computation.
             command: as the attribute.
         """
-        material = material_from(_with_plastic(recipe, parameters, covered=not command))
+        shown = in_scene(_with_plastic(recipe, parameters, covered=not command))
         if recipe.settings.theory == "rigorous":  # before its table is computed
             raise RequestError(f"{name}: got theory=rigorous, wanted a surface of scalar theory")
-        if not command and material.coat_ior > 1 and recipe.settings.wavelengths == VISIBLE:
+        if not command and shown.coat_ior > 1 and recipe.settings.wavelengths == VISIBLE:
             # Of indices in single precision, as Mitsuba has them, so that a scene finds the same spectrum in the cache.
-            index = float(np.float32(material.coat_ior)) / float(np.float32(AIR))
+            index = float(np.float32(shown.coat_ior)) / float(np.float32(AIR))
             settings = replace(recipe.settings, wavelengths=wavelengths_inside(index))
             recipe = replace(recipe, settings=settings)
         spectrum = recipe.cached(progress)
         assert isinstance(spectrum, GratingSpectrum)
-        return cls(name, spectrum, recipe, grating, material, command)
+        return cls(name, spectrum, recipe, grating, shown, command)
 
     @classmethod
     def named(cls, source: str | os.PathLike[str], parameters: Mapping[str, Any]) -> Surface:
@@ -179,8 +171,8 @@ class Surface:
         """
         path, parameters = surface.path, dict(surface.aside)
         if surface.is_spectrum:
-            material = material_from(parameters)
-            return cls(path.stem, surface.spectrum(), None, {"filename": path.name}, material)  # type: ignore[arg-type]
+            shown = in_scene(parameters)
+            return cls(path.stem, surface.spectrum(), None, {"filename": path.name}, shown)  # type: ignore[arg-type]
         if (theory := parameters.pop("theory", "scalar")) != "scalar":
             raise RequestError(f"theory: got {theory}, wanted scalar")
         own, recipe, command = dict(surface.values), surface.recipe, ""
@@ -202,7 +194,8 @@ class Surface:
 
 
 SHORTEST = VISIBLE[0]  # nm, of the wavelengths of a page
-OF_SCENE = ("theory", *(field.name for field in fields(ViewedMaterial)), *_NOT_SHOWN)
+_SHOWN = ("coat_ior", "height_scale", "int_ior", "material", "orientation")
+OF_SCENE = ("theory", *_SHOWN, *_NOT_SHOWN)
 """Names of what a scene says of a grating, beside the values of its recipe."""
 
 
@@ -222,19 +215,25 @@ def _with_plastic(recipe: Recipe, parameters: Mapping[str, Any], covered: bool) 
     return own | dict(parameters)
 
 
-def material_from(parameters: Mapping[str, Any]) -> ViewedMaterial:
-    """Return the material from the parameters of a scene.
+def in_scene(parameters: Mapping[str, Any]) -> InScene:
+    """Return what a page shows of the parameters of a scene.
 
     Raises:
         RequestError: if one is wrong, or not shown in a page.
     """
-    known = {field.name for field in fields(ViewedMaterial)}
     for name, value in parameters.items():
         if name in _NOT_SHOWN:
             raise RequestError(f"{name}: got {value!r}, and the page shows {_NOT_SHOWN[name]}")
-        if name not in known:
-            similar = did_you_mean(name, known)
-            raise RequestError(f"{name}: got {value!r}, wanted a parameter among {', '.join(sorted(known))}{similar}")
+        if name not in _SHOWN:
+            similar = did_you_mean(name, _SHOWN)
+            raise RequestError(f"{name}: got {value!r}, wanted a parameter among {', '.join(_SHOWN)}{similar}")
+        if name in ("int_ior", "coat_ior") and not is_number(value):
+            raise RequestError(f"{name}: got {value!r}, wanted a number")
     if "material" in parameters and "int_ior" in parameters:
         raise RequestError("material: a conductor or a perfect mirror takes no int_ior; give one or the other")
-    return replace(ViewedMaterial(), **parameters)
+    if not 1 < (n := parameters.get("int_ior", DEFAULT_INT_IOR)) <= 10:
+        raise RequestError(f"int_ior: got {n!r}, wanted an index above 1, at most 10")
+    if not 1 <= (n := parameters.get("coat_ior", 1.0)) <= 10:
+        raise RequestError(f"coat_ior: got {n!r}, wanted an index of 1 (no layer) to 10")
+    media = Media(MediumBelow.requested(parameters), constant(AIR), constant(n))
+    return InScene(media, parameters.get("orientation", 0.0), parameters.get("height_scale", 1.0))

@@ -261,3 +261,20 @@ def test_a_coat_that_a_saved_spectrum_does_not_cover_is_refused(command, tmp_pat
     code, _, error = command("view saved.exr,coat_ior=1.5 --no-open")
     assert code == 2
     assert "coat_ior: got 1.5, wanted at most 1: the spectrum was built for wavelengths from 360 nm" in error
+
+
+def test_a_page_asks_what_the_medium_below_is(tmp_path):
+    """A metal of a file is a metal, and glass is a dielectric, whatever parameter named it."""
+    (tmp_path / "metal.csv").write_text("wl,n,k\n0.3,0.5,3\n0.9,0.5,6\n")
+    surface = {"depth": 0.02, "samples": 32, "coherence_length": 2.0}
+
+    def data(**material):
+        text = pages.page(Surface.named("blazed", {**surface, **material}))
+        return json.loads(re.search('<script id="data" type="application/json">(.*)</script>', text)[1])
+
+    metal = data(material=str(tmp_path / "metal.csv"))
+    assert metal["material"]["material"] == "metal.csv"
+    assert "metal.csv" in metal["metals"]
+    glass = data(material="BK7")
+    assert glass["material"]["material"] == ""
+    assert glass["material"]["int_ior"] == pytest.approx(1.5185, abs=1e-4)
