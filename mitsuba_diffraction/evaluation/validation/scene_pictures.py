@@ -2,7 +2,8 @@
 
 Eight pictures each, with independent random numbers, are averaged over 4 × 4 blocks. The standard error of a block is
 the larger one of two estimates: from the means of the block in each picture, which holds however its pixels are
-correlated, and from its pixels, which is less uncertain. A difference of more than six standard errors is a fault.
+correlated, and from its pixels, which is less uncertain, but at least 0.05 % of the mean of the picture. A difference
+of more than six standard errors is a fault.
 
 The reference is `path`. Where a surface has null interactions, as `mask` has, it is `prb`, Mitsuba's path tracer in
 Python: `path` of Mitsuba 3.9.1 drops the light of rays that leave the scene after null interactions alone. (`volpath`
@@ -35,6 +36,7 @@ _BANDS = 3  # of the wavelengths of a spectral film
 _WIDTH = 32  # pixels
 SECONDS = 30.0
 _ROUNDING = 1e-5  # relative, of sums in single precision
+_MIN_ERROR = 5e-4  # of a block, relative to the mean of the picture: nearly black ones have few bright paths
 _TIMED_SPP, _LOG2_SPP = 32, (2, 12)
 
 PictureStack = Sequence[NDArray[np.floating]] | NDArray[np.floating]
@@ -63,7 +65,7 @@ class PictureDifference:
         (mean, error), (wanted, its_error) = (_block_means(pictures, blocks) for pictures in both)
         total, of_total = (_mean_and_error(pictures.mean((1, 2, 3))) for pictures in both)
         change, scale = mean - wanted, of_total[0] or 1.0
-        error = np.maximum(np.hypot(error, its_error), _ROUNDING * np.abs(wanted))
+        error = np.maximum(np.hypot(error, its_error), np.maximum(_ROUNDING * np.abs(wanted), _MIN_ERROR * abs(scale)))
         with np.errstate(divide="ignore", invalid="ignore"):
             deviations = np.where(change == 0, 0.0, change / error)
         ratio = 1.0 if total[0] == of_total[0] else total[0] / scale
