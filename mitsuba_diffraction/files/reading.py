@@ -20,7 +20,7 @@ from ..progress import bytes_text
 
 MAX_FILE_BYTES = 2**31
 MAX_SMALL_ARRAY_BYTES = 2**27  # of an array from a file of any size: 4096 × 4096 numbers in float64
-MAX_EXPANSION = 24  # of a file into an array; numbers of 8 bits without compression expand into float64 by 8
+MAX_EXPANSION = 16  # of a file into an array; numbers of 8 bits without compression expand into float64 by 8
 
 # What zipfile raises of a damaged archive, and where a member is encrypted or compressed in an unknown way.
 BAD_ARCHIVE = (

@@ -302,4 +302,8 @@ def _as_micrometres(numbers: NDArray, height_range: float | None) -> NDArray[np.
             f"height_range: got {numbers.dtype} heights from {minimum} to {maximum}, a tiny part of the range of "
             "their type; wanted floats in µm, or a type that they fill, such as uint16"
         )
-    return (numbers.astype(np.float64) - scale.min) / (float(scale.max) - scale.min) * float(height_range)
+    heights = numbers.astype(np.float64)
+    heights -= scale.min  # in place: each further array would take the memory of a large scan again
+    heights /= float(scale.max) - scale.min
+    heights *= float(height_range)
+    return heights
