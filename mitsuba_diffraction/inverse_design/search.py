@@ -29,7 +29,7 @@ _COARSE, _FINE = 3, 6  # pixels along a texel: of the first searches, and of the
 _FIRST_ITERATIONS, _LAST_ITERATIONS = 75, 400
 _FIXED_FRACTIONS = (0.4, 0.7, 0.9, 1.0)  # of the texels, that are set to levels one round after the other
 _LOSSES_PER_ITERATION = 1.1
-_TIMED_LOSSES = 5  # for the estimate of the time
+_TIMED_LOSSES = 2  # for the estimate of the time
 _MAX_MEMORY = 16e9  # bytes, where the system does not say how many are available
 _CORRECTIONS, _TOLERANCE = 20, 1e-8  # of L-BFGS-B: stored steps, and the decrease of L at which it ends
 

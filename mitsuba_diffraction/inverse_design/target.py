@@ -6,6 +6,7 @@ import math
 
 import numpy as np
 import scipy.ndimage
+import scipy.sparse
 from numpy.typing import ArrayLike
 
 from ..array_types import Real
@@ -86,25 +87,30 @@ def finest_strokes(target: ArrayLike) -> float:
     brighter than half of the maximum (granulometry: Matheron 1975, Random Sets and Integral Geometry).
     """
     picture = np.asarray(target, np.float64)
-    grey = picture if picture.ndim == 2 else picture.mean(axis=-1)
-    step = math.ceil(max(grey.shape) / _MAX_PIXELS)
-    bright = np.pad(grey[::step, ::step] > grey.max() / 2, 1)
+    step = math.ceil(max(picture.shape[:2]) / _MAX_PIXELS)
+    few = picture[::step, ::step]
+    grey = few if few.ndim == 2 else few.mean(axis=-1)
+    bright = np.pad(grey > grey.max() / 2, 1)
     depth = scipy.ndimage.distance_transform_edt(bright)
     for radius in range(2, math.ceil(depth.max()) + 1):
         opened = scipy.ndimage.distance_transform_edt(depth < radius) < radius
         if np.count_nonzero(opened & bright) < _KEPT * np.count_nonzero(bright):
             break
     else:
-        radius = math.ceil(depth.max()) + 1
+        radius = max(math.ceil(depth.max()), 1) + 1
     # The last radius that keeps it is of strokes of 2 radius − 1 or 2 radius pixels.
-    return max(grey.shape) / step / (2 * radius - 2.5)
+    return max(picture.shape[:2]) / step / (2 * radius - 2.5)
 
 
 def _in_bins(channels: Real, count: int) -> Real:
     """Return a picture, rows from the top, in square bins, rows from the bottom: (count, count, channels)."""
     size = max(channels.shape[:2])
-    rows, columns = (_overlaps(n, size, count) for n in channels.shape[:2])
-    return np.einsum("ir,rcs,jc->ijs", rows, channels[::-1], columns) * (count / size) ** 2
+    rows, columns = (scipy.sparse.csr_array(_overlaps(n, size, count)) for n in channels.shape[:2])
+    # Each pixel is in one or two bins along each axis.
+    strips = rows[:, ::-1] @ channels.reshape(len(channels), -1)  # (count, columns · channels)
+    strips = strips.reshape(count, *channels.shape[1:]).swapaxes(0, 1)
+    found = columns @ strips.reshape(len(strips), -1)
+    return found.reshape(count, count, -1).swapaxes(0, 1) * (count / size) ** 2
 
 
 def _overlaps(pixels: int, length: int, bins: int) -> Real:
