@@ -26,7 +26,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..errors import RequestError, pip_install
-from .passes import Job, Tracer, trace_band, versions
+from .passes import Job, Tracer, content_of, trace_band, versions
 from .trace_pass import LightOfBands
 
 if TYPE_CHECKING:
@@ -199,7 +199,8 @@ def _trace_on_worker(job: Job, index: int) -> NDArray[np.float32]:
 def scene_of(job: Job) -> mi.Scene:
     """Load the scene of a job, once; raise RuntimeError if the scene or one of its files differs from the job."""
     try:
-        scene, content = job.scene.load(), job.scene.digest()
+        scene = job.scene.load()
+        content = content_of(job.scene, scene)
     except (RequestError, OSError) as error:
         raise RuntimeError(f"a worker cannot load the scene: {error}") from None
     if content != job.content:
