@@ -277,4 +277,4 @@ def test_a_page_asks_what_the_medium_below_is(tmp_path):
     assert "metal.csv" in metal["metals"]
     glass = data(material="BK7")
     assert glass["material"]["material"] == ""
-    assert glass["material"]["int_ior"] == pytest.approx(1.5185, abs=1e-4)
+    assert glass["material"]["int_ior"] == pytest.approx(1.5187, abs=1e-4)  # of the data sheet at 546 nm
