@@ -391,6 +391,12 @@ def test_a_recipe_is_read_without_scipys_interpolation():
     assert in_a_fresh_process(program) == ["False"]
 
 
+def test_the_command_line_is_read_without_solvers():
+    """Those of SciPy took a third of the imports before a picture, and few commands use them."""
+    program = "import sys\nimport mitsuba_diffraction.cli\nprint(*sys.modules)"
+    assert not {"scipy.optimize", "scipy.sparse.linalg", "scipy.interpolate"} & set(in_a_fresh_process(program))
+
+
 def test_a_variant_is_set_without_the_modules_of_the_plugins():
     """They are imported when a scene first has a plugin, whose class is made once."""
     printed = in_a_fresh_process(

@@ -9,7 +9,6 @@ from collections.abc import Callable, Sequence
 import numpy as np
 import scipy.fft
 import scipy.ndimage
-import scipy.optimize
 from numpy.typing import ArrayLike, NDArray
 
 from ..array_types import Real
@@ -227,6 +226,8 @@ class _Search:
         self, far_field: FarField, heights: Real, iterations: int, fixed: NDArray[np.bool_] | bool = False
     ) -> Real:
         """Return the heights of the smallest loss that L-BFGS-B finds from `heights`, some of them `fixed`."""
+        from scipy.optimize import Bounds, minimize
+
         self._found.append((math.inf, heights))
 
         def loss(flat: Real) -> tuple[float, Real]:
@@ -241,12 +242,12 @@ class _Search:
             self._done += 1
             self._progress(self._done, self._total)
 
-        scipy.optimize.minimize(
+        minimize(
             loss,
             heights.ravel(),
             jac=True,
             method="L-BFGS-B",
-            bounds=scipy.optimize.Bounds(
+            bounds=Bounds(
                 np.where(fixed, heights, 0).ravel(), np.where(fixed, heights, self._plate.height_range).ravel()
             ),
             callback=report,

@@ -8,8 +8,6 @@ from numbers import Real
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
-from scipy import sparse
-from scipy.sparse.linalg import splu
 
 from ..errors import RequestError
 
@@ -195,6 +193,9 @@ def harmonic_fill(heights: ArrayLike, pixel_size: tuple[float, float] = (1.0, 1.
         ValueError: if the heights are not a two-dimensional array of real numbers with at least one pixel, or if all
             of them are missing.
     """
+    from scipy import sparse
+    from scipy.sparse.linalg import splu
+
     heights = as_heights(heights)
     missing = ~np.isfinite(heights)
     rows, columns = np.nonzero(missing)
