@@ -637,6 +637,7 @@ def test_figures_show_y_upwards():
     assert bottom < top
 
 
+@pytest.mark.few(1)
 @pytest.mark.parametrize(
     ("period", "said"),
     [
