@@ -95,6 +95,12 @@ FIGURES = (
     Figure(("first_scene.png",), "python tools/manual/first_scene.py {out}/first_scene.png"),
     Figure(("inspect.png",), "mitsuba-diffraction inspect precompute/elaphe.toml -o {out}/inspect.png"),
     Figure(
+        ("lamp.webp",),
+        """mitsuba-diffraction render scenes/compact_disc.xml -D table=dark -D azimuth=-180:168 --exposure 2.8 \
+            --width 320 --height 180 --spp 9 --denoise --frames 30 -o {out}/lamp.png""",
+        3,
+    ),
+    Figure(
         ("measured_gratings.png", "measured_transmission.png"),
         "python tools/manual/measured_figures.py {out}/measured_gratings.png {out}/measured_transmission.png",
     ),
