@@ -364,6 +364,12 @@ def scene_of(seed: int, folder: Path, files: dict[str, Path]) -> Path:
     return path
 
 
+def _is_path(path: Path) -> bool:
+    """Whether `diffraction_path` traces a scene by `path`."""
+    scene = SceneFile(path).load()
+    return scene.integrator().parts(scene, scene.sensors()[0])[0] is scene.integrator().path
+
+
 def judge_scene(seed: int, folder: Path, files: dict[str, Path]) -> SceneComparison:
     """Compare the pictures of a scene; again, longer and with other seeds, if they differ.
 
@@ -375,6 +381,8 @@ def judge_scene(seed: int, folder: Path, files: dict[str, Path]) -> SceneCompari
     mi.set_variant("llvm_ad_spectral")
     path = scene_of(seed, folder, files)
     found = compare_scene(SceneFile(path), seconds=SECONDS)
+    if not found.difference.is_noise and found.reference == "prb" and _is_path(path):
+        return found  # with the fault of `path` behind null interactions
     if not found.difference.is_noise:
         found = compare_scene(SceneFile(path), seconds=LONGER * SECONDS, first_seed=100)
     dr.flush_malloc_cache()
