@@ -416,7 +416,7 @@ def folder(tmp_path, monkeypatch):
 
 @pytest.mark.slow
 def test_inspect_prints_numbers_and_draws_a_slide(folder, command):
-    code, out, err = command("inspect waves.npy,pixel_size=0.08 --json numbers.json")
+    code, out, err = command("inspect waves.npy,pixel_size=0.08,extent=sample --json numbers.json")
     assert (code, err) == (0, "")
     for words in (
         "8 × 8 µm, 100 × 100 pixels",
