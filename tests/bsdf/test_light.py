@@ -10,6 +10,7 @@ from bsdf_support import albedo, direction, made_up, plugin
 import mitsuba_diffraction as md
 from mitsuba_diffraction.bsdf.base import gratings_in
 from mitsuba_diffraction.bsdf.light import _emits
+from mitsuba_diffraction.precomputation.surface_text import written
 from mitsuba_diffraction.settings import ScalarSettings
 
 WAVELENGTHS = (450.0, 530.0, 600.0, 700.0)
@@ -357,8 +358,8 @@ def test_a_rigorous_table_to_be_saved_is_of_wavelengths_at_which_its_index_is_kn
     inside = r"light of 420 to 840 nm, .* inside ext_ior=1\.2: light of 350 to 700 nm in air has 292 to 583"
     with pytest.raises(ValueError, match=inside):
         md.precompute(md.gratings.sinusoidal(0.7, 0.1), **settings, ext_ior=1.2, wavelengths=(350, 700))
-    options = (f"--{name}={value}" for name, value in settings.items())
-    code, _, error = command("precompute", "sinusoidal", *options, "-o", str(tmp_path / "table.exr"))
+    surface = written("sinusoidal", {"period": 0.7, "depth": 0.1, **settings})
+    code, _, error = command("precompute", surface, "-o", str(tmp_path / "table.exr"))
     assert code == 2
     assert re.search(refusal, error)
 

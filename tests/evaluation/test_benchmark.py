@@ -20,6 +20,7 @@ from mitsuba_diffraction.evaluation.benchmark.cases import Case, bundled_cases, 
 from mitsuba_diffraction.evaluation.benchmark.measured import measured_bsdf
 from mitsuba_diffraction.evaluation.benchmark.sampling import measure
 from mitsuba_diffraction.evaluation.benchmark.speed import Rays
+from mitsuba_diffraction.precomputation.requested_surface import RequestedSurface
 from mitsuba_diffraction.settings import VISIBLE
 from mitsuba_diffraction.spectrum.tables import SliceTable
 
@@ -119,10 +120,13 @@ def test_the_bundled_surfaces_are_those_of_the_recipes():
         assert cases[name].height_field.digest == recipe.height_field().digest
 
 
-def test_a_scan_is_read_as_a_sample(scan):
-    case = scan_case(scan("elaphe"))
-    assert case.extent == "sample"
-    assert case.coherence_length == pytest.approx(2.93)
+def test_a_scan_has_the_extent_and_the_coherence_length_of_its_request(scan_file):
+    text = f"{scan_file('elaphe')},pixel_size=0.0586,height_range=0.375"
+    cases = [
+        scan_case(RequestedSurface.of(text + given).recipe) for given in ("", ",coherence_length=2", ",extent=tile")
+    ]
+    assert [case.extent for case in cases] == ["sample", "sample", "tile"]
+    assert [case.coherence_length for case in cases] == pytest.approx([2.93, 2, 65])
 
 
 @pytest.mark.slow
