@@ -148,21 +148,6 @@ def test_orientation_rotates_the_pattern(llvm):
     np.testing.assert_allclose(value, wanted, rtol=1e-3, atol=1e-4 * wanted.max())
 
 
-@pytest.mark.slow
-def test_the_bsdf_is_reciprocal(llvm):
-    bsdf = raw_plugin(spectrum("crossed", 3.0), int_ior=1.5)
-    rng = np.random.default_rng(2)
-    wi = random_directions(rng, 2000, 0.1)
-    q = rng.integers(-2, 3, (2000, 2)) / 2.0 + rng.normal(0, 0.1, (2000, 2))
-    wo = towards(wi, q, 500)
-    keep = wo[:, 2] > 0.05
-    wi, wo = wi[keep], wo[keep]
-    there = evaluate(bsdf, wi, wo)[0] / wo[:, 2:]
-    back = evaluate(bsdf, wo, wi)[0] / wi[:, 2:]
-    assert there.max() > 0
-    np.testing.assert_allclose(there, back, rtol=1e-4, atol=1e-6 * there.max())
-
-
 @pytest.mark.few(2)
 @pytest.mark.parametrize("name", sorted(MAKE))
 def test_values_are_finite_for_any_directions(llvm, name):

@@ -72,17 +72,6 @@ def test_a_coat_of_air_changes_nothing(llvm):
     np.testing.assert_allclose(with_coat, without, rtol=2e-3, atol=1e-5)
 
 
-@pytest.mark.parametrize("material", [{"material": "none"}, {"material": "Al"}, {"int_ior": 1.8}])
-def test_a_coated_grating_is_reciprocal(llvm, material):
-    rng = np.random.default_rng(1)
-    wi, wo = random_directions(rng, 500, 0.1), random_directions(rng, 500, 0.1)
-    bsdf = coated(**material)
-    there = testing.evaluate(bsdf, wi, wo, [450, 650]) / wo[:, 2:]
-    back = testing.evaluate(bsdf, wo, wi, [450, 650]) / wi[:, 2:]
-    np.testing.assert_allclose(there, back, rtol=1e-4, atol=1e-4)
-    assert there.max() > 0.01
-
-
 @pytest.mark.parametrize("theta", [0, 45, 75, 88])
 @pytest.mark.parametrize("turned", [0, 70])
 def test_the_front_face_follows_fresnel_and_no_light_is_gained(llvm, theta, turned):

@@ -13,7 +13,7 @@ import mitsuba_diffraction as md
 from mitsuba_diffraction import testing
 
 INDEX = 1.5
-DENSE = (240.0, 830.0)  # nm, the wavelengths in a medium of this index
+DENSE = (225.0, 830.0)  # nm, the wavelengths in a medium of an index up to 1.6
 
 
 def scalar(heights, **settings):

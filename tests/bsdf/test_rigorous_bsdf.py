@@ -102,15 +102,6 @@ def test_f_is_the_sum_over_the_orders(llvm, spectrum):
     np.testing.assert_allclose(value[:, 0], wanted, rtol=5e-3, atol=1e-3 * wanted.max())
 
 
-def test_the_bsdf_is_reciprocal(llvm, spectrum):
-    wi, wo = pairs(spectrum, 0.47)
-    there, back = (
-        testing.evaluate_pdf(plugin(spectrum), a, b, (470.0,) * 4)[0][:, 0] / b[:, 2] for a, b in ((wi, wo), (wo, wi))
-    )
-    assert there.max() > 0
-    np.testing.assert_allclose(there, back, rtol=1e-4, atol=1e-6 * there.max())
-
-
 @pytest.mark.few(3)
 @pytest.mark.parametrize("theta", [0, 40, 75, 88])
 def test_samples_have_even_weights_that_average_to_the_efficiencies(llvm, spectrum, theta):
@@ -380,13 +371,6 @@ def test_a_coat_transmits_the_efficiencies_of_the_solver(llvm):
 @pytest.mark.parametrize("theta", [40, 0, 75])
 def test_samples_under_a_coat_pass_the_chi_square_test(llvm, theta):
     check_chi_square(under_coat(made_up(3.0)), direction(theta, 20), (600.0, 700.0, 800.0, 900.0))
-
-
-def test_a_grating_under_a_coat_is_reciprocal(llvm):
-    bsdf, (wi, wo) = under_coat(made_up()), pairs(made_up(), 0.7)
-    there, back = (testing.evaluate_pdf(bsdf, a, b, (700.0,) * 4)[0][:, 0] / b[:, 2] for a, b in ((wi, wo), (wo, wi)))
-    assert there.max() > 0
-    np.testing.assert_allclose(there, back, rtol=2e-4, atol=1e-5 * there.max())
 
 
 def test_unpolarised_light_is_polarised_under_a_coat(solved):
