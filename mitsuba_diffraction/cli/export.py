@@ -9,10 +9,12 @@ from typing import Annotated
 import typer
 
 from ..errors import RequestError
-from ..export.cycles import shader_recipe, write_shader
+from ..export.cycles import write_shader
 from ..export.exported_grating import ExportedGrating
 from ..export.lswm import write_lswm
+from ..export.node_tables import write_node_tables
 from ..export.order_table import write_order_table
+from ..export.shader_tables import ShaderTables, shader_recipe
 from ..files.outputs import check_outputs
 from ..precomputation.grating_spectrum import GratingSpectrum
 from ..precomputation.requested_surface import RequestedSurface
@@ -32,6 +34,7 @@ _OPTIONS = {"wavelengths": "--wavelength", "angles": "--angle", "azimuths": "--a
 _OF_MATERIAL = ("theory", "material", "int_ior")
 _INPUTS = {"orientation": "Orientation", "height_scale": "HeightScale", "base": "BaseColor"}  # of the shader
 _IN_SCENES = ("coat_ior", "thin_film_ior", "thin_film_thickness", "transmission", "ext_ior", "lateral_scale", *_INPUTS)
+_SHADERS = {".osl": write_shader, ".npz": write_node_tables}
 _RANGES = {
     ".csv": {"wavelength": "400:700:10", "angle": "0:80:5", "azimuth": "0"},
     ".json": {"wavelength": "450:650:50", "angle": "0:80:10", "azimuth": "0:360:30"},
@@ -43,7 +46,7 @@ def export(
         str,
         typer.Argument(
             metavar=SURFACE,
-            help="a recipe (.toml), a profile, a scan, or for .osl a saved spectrum (.exr); "
+            help="a recipe (.toml), a profile, a scan, or for .osl and .npz a saved spectrum (.exr); "
             f"{KEYS_OF_RECIPES}, theory, material, int_ior",
         ),
     ],
@@ -52,8 +55,8 @@ def export(
         typer.Option(
             "-o",
             "--output",
-            help=".osl: a shader for Blender's Cycles; .csv: the orders as a table; .json: a grating for Zemax "
-            "OpticStudio and Speos",
+            help=".osl: a shader for Blender's Cycles; .npz: its tables, for Blender's own nodes; .csv: the orders as "
+            "a table; .json: a grating for Zemax OpticStudio and Speos",
         ),
     ],
     wavelength: Annotated[
@@ -73,12 +76,12 @@ def export(
 ) -> None:
     """Write a surface for another program."""
     requested = RequestedSurface.of(surface, aside=(*_OF_MATERIAL, *_IN_SCENES))
-    check_suffix("-o", output, ".osl", *_RANGES)
+    check_suffix("-o", output, *_SHADERS, *_RANGES)
     ranges = {"wavelength": wavelength, "angle": angle, "azimuth": azimuth}
     given = {key: text for key, text in ranges.items() if text is not None}
     _refuse_parameters_of_scenes(requested, output)
     check_outputs(requested.files, [("-o", output)], overwrite=overwrite)
-    if output.suffix.lower() == ".osl":
+    if output.suffix.lower() in _SHADERS:
         if given:
             raise RequestError(f"--{', --'.join(given)}: {output} holds all directions and colours, wanted it without")
         _write_shader(requested, output)
@@ -90,7 +93,7 @@ def export(
 
 def _refuse_parameters_of_scenes(requested: RequestedSurface, output: Path) -> None:
     """Refuse parameters of the plugin that files for other programs do not hold, and say what does."""
-    is_shader = output.suffix.lower() == ".osl"
+    is_shader = output.suffix.lower() in _SHADERS
     for key in _IN_SCENES:
         if key in requested.aside:
             instead = f"set the input {_INPUTS[key]} of the shader" if is_shader and key in _INPUTS else ""
@@ -112,10 +115,11 @@ def _write_shader(requested: RequestedSurface, output: Path) -> None:
     assert isinstance(spectrum, GratingSpectrum)
     if requested.is_film or requested.media.transmits:
         say("note", f"{title}: the shader shows the light that it reflects; `render` shows what it transmits")
-    held = write_shader(spectrum, output, requested.below)
+    tables = ShaderTables.of_spectrum(spectrum, requested.below)
+    _SHADERS[output.suffix.lower()](tables, output)
     if spectrum.warning:
         tell(f"! {spectrum.warning}")
-    tell(f"{output}: {spectrum.source}; {held}")
+    tell(f"{output}: {spectrum.source}; {tables.held}")
 
 
 def _write_orders(requested: RequestedSurface, output: Path, given: dict[str, str]) -> None:

@@ -82,7 +82,7 @@ class ExportedGrating:
         if requested.is_irregular:
             raise RequestError(
                 f"{requested.title}: got an irregular surface, which has no orders, wanted a grating; the command "
-                "`efficiency --csv` tabulates its peaks, and a file .osl holds its spectrum"
+                "`efficiency --csv` tabulates its peaks, and a file .osl or .npz holds its spectrum"
             )
         field = requested.period
         if is_profile(field):

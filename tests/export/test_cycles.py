@@ -14,6 +14,7 @@ from scipy.special import jv
 
 import mitsuba_diffraction as md
 from mitsuba_diffraction.export.cycles import write_shader
+from mitsuba_diffraction.export.shader_tables import ShaderTables
 from mitsuba_diffraction.optics.color import SRGB_TO_XYZ, delta_E, linear_sRGB_to_XYZ
 from mitsuba_diffraction.optics.media import MediumBelow
 
@@ -58,7 +59,9 @@ def test_a_continuum_holds_all_of_its_power_in_cells(tmp_path):
     smooth = ndimage.gaussian_filter(np.random.default_rng(3).standard_normal((80, 80)), 4, mode="wrap")
     surface = md.HeightField(0.1 * smooth / smooth.std(), 0.09)
     spectrum = md.precompute(surface, extent="sample", coherence_length=3.0, tolerance=0.05)
-    assert "96 × 32 frequencies" in write_shader(spectrum, tmp_path / "c.osl", MediumBelow.of("none"))
+    tables = ShaderTables.of_spectrum(spectrum, MediumBelow.of("none"))
+    assert "96 × 32 frequencies" in tables.held
+    write_shader(tables, tmp_path / "c.osl")
     text = (tmp_path / "c.osl").read_text(encoding="utf-8")
     rows, columns = array(text, "Rows"), array(text, "Columns").reshape(32, 97)
     powers = array(text, "Powers").reshape(32 * 96, -1)
@@ -107,14 +110,37 @@ needs_blender = pytest.mark.skipif(
 SIZE = 96
 
 
-def in_cycles(shader, shape, light, samples, folder):
-    """Linear sRGB of the scene of tools/manual/cycles_picture.py."""
+def in_cycles(shader, shape, light, samples, folder, *space):
+    """Linear sRGB, or RGB of a working space, of the scene of tools/manual/cycles_picture.py."""
     script = Path(__file__).parents[2] / "tools" / "manual" / "cycles_picture.py"
     out = folder / "cycles.npy"
-    words = [BLENDER, script, shader, shape, light, samples, SIZE, out]
+    words = [BLENDER, script, shader, shape, light, samples, SIZE, out, *space]
     done = subprocess.run([str(word) for word in words], capture_output=True, text=True, timeout=900)
     assert out.is_file(), done.stdout + done.stderr
     return np.load(out)
+
+
+def version_of_blender():
+    said = subprocess.run([BLENDER, "-c", "import bpy; print(bpy.app.version)"], capture_output=True, text=True)
+    return tuple(map(int, re.findall(r"\d+", said.stdout)))
+
+
+@pytest.mark.slow
+@needs_blender
+@pytest.mark.parametrize(("space", "published"), [("Linear Rec.2020", "ITU-R BT.2020"), ("ACEScg", "ACEScg")])
+def test_colours_are_the_same_in_each_working_space(space, published, command, tmp_path):
+    if version_of_blender() < (5, 0):
+        pytest.skip("Blender has one working space before 5.0")
+    import colour
+
+    shader = tmp_path / "grating.osl"
+    code, _, error = command("export", "sinusoidal,period=1.6,depth=0.15,material=Al", "-o", str(shader))
+    assert code == 0, error
+    pictures = [in_cycles(shader, "plane", 0.15, 100, tmp_path, *other) for other in ((), (space,))]
+    wanted, found = (picture.mean(axis=(0, 1)) for picture in pictures)
+    spaces = colour.RGB_COLOURSPACES
+    matrix = colour.matrix_RGB_to_RGB(spaces["sRGB"], spaces[published], "Bradford")
+    np.testing.assert_allclose(found, matrix @ wanted, rtol=0.02)
 
 
 def path_traced(bsdf, shape, light, spp):

@@ -2,8 +2,9 @@
 
 Run it by a Python that has bpy (`pip install bpy==4.5.15`, Python 3.11), and NumPy, which comes with it:
 
-    python tools/manual/cycles_picture.py SHADER.osl plane|sphere|disc RADIUS|sky SAMPLES SIZE OUT.npy
+    python tools/manual/cycles_picture.py SHADER.osl plane|sphere|disc RADIUS|sky SAMPLES SIZE OUT.npy [WORKING_SPACE]
 
+In another working space of Blender 5.0 or later, such as "Linear Rec.2020", OUT is RGB of that.
 The wheel has no `oslquery`, by which Blender's window finds the sockets of a shader; they are added by hand here. The
 scene is that of `scene` in tests/export/test_cycles.py.
 """
@@ -61,9 +62,11 @@ def emission(strength):
     return material
 
 
-def build(shader, shape, light, samples, size):
+def build(shader, shape, light, samples, size, space=None):
     """A square, a sphere or a disc with grooves around it, below a lamp of radiance 100 or under a sky of 1."""
     bpy.ops.wm.read_factory_settings(use_empty=True)
+    if space:
+        bpy.ops.wm.set_working_color_space(working_space=space)
     scene = bpy.context.scene
     scene.render.engine = "CYCLES"
     cycles = scene.cycles
@@ -99,8 +102,8 @@ def build(shader, shape, light, samples, size):
     return scene
 
 
-def main(shader, shape, light, samples, size, out):
-    scene = build(shader, shape, light, int(samples), int(size))
+def main(shader, shape, light, samples, size, out, space=None):
+    scene = build(shader, shape, light, int(samples), int(size), space)
     scene.render.filepath = f"{os.path.splitext(out)[0]}.exr"
     began = time.process_time()
     bpy.ops.render.render(write_still=True)
@@ -113,7 +116,7 @@ def main(shader, shape, light, samples, size, out):
 
 
 if __name__ == "__main__":
-    main(*map(os.path.abspath, sys.argv[1:2]), *sys.argv[2:6], os.path.abspath(sys.argv[6]))
+    main(*map(os.path.abspath, sys.argv[1:2]), *sys.argv[2:6], os.path.abspath(sys.argv[6]), *sys.argv[7:])
     with contextlib.suppress(OSError):
         sys.stdout.flush()
     os._exit(0)  # its add-ons print tracebacks when they are freed
