@@ -26,7 +26,7 @@ def available_memory() -> int | None:
             ("memory.limit_in_bytes", "memory.usage_in_bytes", "total_inactive_file"),
         ):
             with suppress(OSError, ValueError):  # "max", or no file: no limit
-                left = int((folder / limit).read_text()) - int((folder / usage).read_text())
+                left = int((folder / limit).read_text("utf-8")) - int((folder / usage).read_text("utf-8"))
                 limits.append(left + _entries(folder / "memory.stat").get(droppable, 0))
     return min((max(limit, 0) for limit in limits if limit is not None), default=None)
 
@@ -38,7 +38,7 @@ def allowed_cores() -> int:
     for folder in _control_groups("cpu"):
         for names in (("cpu.max",), ("cpu.cfs_quota_us", "cpu.cfs_period_us")):
             with suppress(OSError, ValueError):  # "max", or no file: no limit
-                quota, period = map(int, " ".join((folder / name).read_text() for name in names).split())
+                quota, period = map(int, " ".join((folder / name).read_text("utf-8") for name in names).split())
                 if quota > 0:
                     cores = min(cores, max(1, math.ceil(quota / period)))
     return cores
@@ -68,7 +68,7 @@ def _control_groups(controller: str) -> Iterator[Path]:
     """Yield the folders of the control groups of this process and of all groups around them."""
     lines: list[str] = []
     with suppress(OSError):
-        lines = (PROCESS / "cgroup").read_text().splitlines()
+        lines = (PROCESS / "cgroup").read_text("utf-8").splitlines()
     for line in lines:
         number, controllers, path = line.split(":", 2)
         group = PurePosixPath(path.lstrip("/"))
@@ -84,7 +84,7 @@ def _entries(file: Path) -> dict[str, int]:
     """Return the lines `name number` or `name: number` of a file of the kernel, of which there may be none."""
     entries = {}
     with suppress(OSError):
-        for line in file.read_text().splitlines():
+        for line in file.read_text("utf-8").splitlines():
             name, *values = line.replace(":", " ").split() or [""]
             if values and values[0].isdigit():
                 entries[name] = int(values[0])

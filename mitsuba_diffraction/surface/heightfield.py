@@ -24,10 +24,8 @@ def as_pixel_size(value: float | tuple[float, float]) -> tuple[float, float]:
         pair = (float(x), float(y))
     except (TypeError, ValueError, OverflowError):
         raise RequestError(f"pixel_size: got {value!r}, wanted one number or (x, y) in µm") from None
-    if not all(_MIN_PIXEL <= p <= _MAX_PIXEL for p in pair):
-        raise RequestError(
-            f"pixel_size: got {value!r}, wanted positive numbers in µm, {_MIN_PIXEL:g} to {_MAX_PIXEL:g}"
-        )
+    if not all(np.isfinite(p) and p > 0 for p in pair):
+        raise RequestError(f"pixel_size: got {value!r}, wanted positive numbers in µm")
     return pair
 
 
@@ -70,6 +68,8 @@ class HeightField:
                 raise RequestError(f"{name}: got {value!r}, wanted True or False")
         array = np.array(as_heights(heights), order="C")
         pixel_size = as_pixel_size(pixel_size)
+        if not all(_MIN_PIXEL <= p <= _MAX_PIXEL for p in pixel_size):
+            raise RequestError(f"pixel_size: got {pixel_size} µm, wanted {_MIN_PIXEL:g} to {_MAX_PIXEL:g}")
         gaps = ~np.isfinite(array)
         if fill_missing and gaps.any():
             count = int(gaps.sum())
