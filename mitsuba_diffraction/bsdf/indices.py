@@ -146,9 +146,10 @@ def check_spectra(eta: mi.Texture, k: mi.Texture, *known: KnownRange) -> None:
     si.uv = mi.Point2f(on_device(u), on_device(v))
     # In an order that has nothing to do with the pixels, and between the ends, where tables are black.
     fraction = (index + 0.5) / count if shape == (1, 1) else (index * 0.6180339887 + 0.5) % 1
-    si.wavelengths = type(si.wavelengths)(on_device(first + (last - first) * fraction))
+    wavelengths = first + (last - first) * fraction
+    si.wavelengths = type(si.wavelengths)(on_device(wavelengths))
     size: float | np.ndarray = 0.0
-    limit = max_index(1e-3 * (first + (last - first) * fraction))
+    limit = max_index(1e-3 * wavelengths)
     for name, texture in (("eta", eta), ("k", k)):
         values = np.array(dr.detach(texture.eval(si)[0]))
         if (bad := np.flatnonzero(~((values >= 0) & (values <= limit)))).size:

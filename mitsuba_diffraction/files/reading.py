@@ -89,13 +89,18 @@ def check_array(shape: Sequence[int], stored: int, item_bytes: int = 8, max_byte
             more than `MAX_SMALL_ARRAY_BYTES`.
     """
     count = math.prod(shape)
-    limit = int(min(max(MAX_SMALL_ARRAY_BYTES, MAX_EXPANSION * stored), max_bytes)) // item_bytes
+    limit = int(min(_max_unpacked_bytes(stored), max_bytes)) // item_bytes
     if count > limit or min(shape, default=0) < 0:
         got = " × ".join(map(str, shape))
         raise RequestError(
             f"got {got} numbers in {bytes_text(stored)}, wanted at most {limit}: crop it, or store it without "
             "compression"
         )
+
+
+def _max_unpacked_bytes(stored: int) -> int:
+    """Return how many bytes a file of `stored` bytes may take in memory."""
+    return max(MAX_SMALL_ARRAY_BYTES, MAX_EXPANSION * stored)
 
 
 def unpacked_members(archive: zipfile.ZipFile, members: Sequence[str], stored: int) -> dict[str, bytes]:
@@ -121,7 +126,7 @@ def unpacked_members(archive: zipfile.ZipFile, members: Sequence[str], stored: i
 
 def check_unpacked(count: int, stored: int) -> None:
     """Check the number of bytes that a file of `stored` bytes declares to hold, compressed; errors of `check_array`."""
-    limit = min(max(MAX_SMALL_ARRAY_BYTES, MAX_EXPANSION * stored), MAX_FILE_BYTES)
+    limit = min(_max_unpacked_bytes(stored), MAX_FILE_BYTES)
     if count > limit:
         raise RequestError(
             f"got {bytes_text(stored)} that unpack to {bytes_text(count)}, wanted at most {bytes_text(limit)}"

@@ -63,7 +63,7 @@ class OrderEfficiencies:
 
     @property
     def incidence(self) -> Real:
-        """Return the angle of incidence at each angle and wavelength, degrees, (a, w)."""
+        """The angle of incidence at each angle and wavelength, degrees, (a, w)."""
         return at_wavelengths(self.angles, len(self.wavelengths))
 
     @property
@@ -145,8 +145,11 @@ class OrderEfficiencies:
         over_wavelengths = littrow or len(self.angles) <= len(self.wavelengths)
         x, along = (self.wavelengths, 1) if over_wavelengths else (self.angles, 2)
         panels = figure.subplots(1, self.values.shape[along], sharey=True, squeeze=False)[0]
-        titles = [f"{angle:g}° incidence" for angle in self.angles] if not littrow else ["Littrow mounting"]
-        if not over_wavelengths:
+        if littrow:
+            titles = ["Littrow mounting"]
+        elif over_wavelengths:
+            titles = [f"{angle:g}° incidence" for angle in self.angles]
+        else:
             titles = [f"{wavelength:g} nm" for wavelength in self.wavelengths]
         for axes, title, values in zip(panels, titles, np.moveaxis(self.values, along, 0), strict=True):
             for number, index in enumerate(self._strongest(_MAX_LINES)):

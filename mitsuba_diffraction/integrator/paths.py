@@ -180,7 +180,10 @@ def _is_grating_only(bsdf: mi.BSDF) -> bool:
 
 
 def _kind_of(bsdf: mi.BSDF) -> int:
-    """Return the kind of a BSDF with gratings; no mixture is `mask`, whose samples have densities without opacity."""
+    """Return the kind of a BSDF with gratings.
+
+    `mask` counts as no mixture: the densities of its samples leave out the opacity.
+    """
     flags = bsdf.flags()
     transmits = flags & +mi.BSDFFlags.GlossyTransmission and not flags & +mi.BSDFFlags.Null
     if transmits and not _holds_gratings_only(bsdf):
@@ -452,7 +455,7 @@ class SplatBuffer:
 def unpacked(splats: NDArray[np.float32]) -> tuple[mi.Point2f, mi.Spectrum, mi.Spectrum]:
     """Return positions, wavelengths and values of contributions, see `LightPaths.splats`.
 
-    Of one or none zeros follow: kernels of arrays of one number, or without them, are others.
+    Fewer than two are followed by zeros: arrays of one number, and empty ones, have kernels of their own.
     """
     splats = np.pad(splats, ((0, max(2 - len(splats), 0)), (0, 0)))
     x, y, *rest = (on_device(column) for column in splats.T)

@@ -34,7 +34,7 @@ class SceneCache:
             self._held, self._state, self._made = [dr.copy(dr.detach(value)) for _, value in parameters], state, {}
 
     def once(self, name: str, make: Callable[[], Made]) -> Made:
-        """Return what a function makes of the scene, which it is called for only if it has not been."""
+        """Return the result of `make`, which is called if no result of this name is kept."""
         if name not in self._made:
             self._made[name] = make()
         return cast(Made, self._made[name])

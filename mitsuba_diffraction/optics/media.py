@@ -14,7 +14,7 @@ from ..settings import TRANSMISSIONS, VISIBLE
 from .materials import KnownRange, RefractiveIndex, constant, index_of, is_file
 
 DEFAULT_INT_IOR = 1.5
-"""Index of the dielectric below a relief of which nothing else is said."""
+"""Index of the dielectric below a relief by default."""
 SAME_INDEX = 1e-3  # indices of refraction that differ by less, as for air and vacuum, are taken as equal
 
 _NAMES = ("material", "int_ior")

@@ -1,4 +1,4 @@
-"""What a command says of a surface: its source, values that replace those of a recipe, and whether it is a tile."""
+"""A surface as a command requests it: its source, values that replace those of a recipe, and whether it is a tile."""
 
 from __future__ import annotations
 
@@ -116,10 +116,12 @@ class RequestedSurface:
             raise RequestError(f"{self.title}: got {', '.join(unknown)}, {wanted}")
         return Recipe({**recipe.surface, **of_surface}, recipe.settings, recipe.folder)
 
-    @property
-    def _seam_decides(self) -> bool:
-        """Whether it is a scan of which nobody says whether it is a tile."""
-        return self.kind == "scan" and "extent" not in self.values and isinstance(self.stated.settings, ScalarSettings)
+    @cached_property
+    def _tile_by_seam(self) -> tuple[bool, str] | None:
+        """Whether a scan without `extent` repeats without a seam, and why; None of other surfaces."""
+        if self.kind != "scan" or "extent" in self.values or not isinstance(self.stated.settings, ScalarSettings):
+            return None
+        return repeats_without_seam(self.stated.height_field())
 
     @cached_property
     def recipe(self) -> Recipe:
@@ -128,15 +130,14 @@ class RequestedSurface:
         A scan whose `extent` is not given is one period of a grating if it repeats without a seam, and a sample of an
         irregular surface otherwise; for errors see `stated`.
         """
-        if self._seam_decides and not repeats_without_seam(self.stated.height_field())[0]:
-            return self.stated.as_sample()
-        return self.stated
+        is_tile, _ = self._tile_by_seam or (True, "")
+        return self.stated if is_tile else self.stated.as_sample()
 
     def say_extent(self) -> None:
-        """Say what was made of a scan whose `extent` is not given, once all of a request is checked."""
-        if not self._seam_decides:
+        """Print as what a scan without `extent` is taken, once all of a request is checked."""
+        if self._tile_by_seam is None:
             return
-        is_tile, reason = repeats_without_seam(self.stated.height_field())
+        is_tile, reason = self._tile_by_seam
         found = "tile" if is_tile else "sample"
         advice = "" if is_tile else "; extent=tile repeats it, prepare=crop_periods crops it to whole periods"
         say("note", f"{self.title}: taken as extent={found}: {reason}{advice}")
@@ -158,7 +159,7 @@ class RequestedSurface:
 
     @property
     def _of_recipe(self) -> Mapping[str, Any]:
-        """What its recipe says of its media, among other parameters."""
+        """The parameters of its recipe, those of its media among them."""
         return {} if self.is_spectrum else self.stated.settings.chosen
 
     @property

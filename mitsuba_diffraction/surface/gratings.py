@@ -79,7 +79,10 @@ def ruled(
     if blaze_ior is not None and not (is_number(blaze_ior) and 1 < blaze_ior < 10):
         raise RequestError(f"blaze_ior: got {blaze_ior!r}, wanted an index above 1")
     period = 1000 / lines_per_mm
-    if blaze_angle is not None:
+    if blaze_angle is None:
+        blaze_wavelength = 500.0 if blaze_wavelength is None else blaze_wavelength
+        facet = _blaze_angle(period, blaze_wavelength, blaze_ior)
+    else:
         if blaze_wavelength is not None:
             raise RequestError(f"blaze_angle: got {blaze_angle!r} and blaze_wavelength, wanted one of the two")
         limit = 90.0 if blaze_ior is None else np.degrees(np.arcsin(1 / blaze_ior))
@@ -88,24 +91,25 @@ def ruled(
         facet = float(np.deg2rad(blaze_angle))
         path = 2 * np.sin(facet) if blaze_ior is None else np.sin(np.arcsin(blaze_ior * np.sin(facet)) - facet)
         blaze_wavelength = float(1e3 * period * path)
-    else:
-        blaze_wavelength = 500.0 if blaze_wavelength is None else blaze_wavelength
-        check_positive("blaze_wavelength", blaze_wavelength, "of nm")
-        if blaze_wavelength < 10:
-            raise RequestError(f"blaze_wavelength: got {blaze_wavelength:g} nm, wanted at least 10 nm, not µm")
-        sine = blaze_wavelength * 1e-3 / (period if blaze_ior else 2 * period)
-        if sine >= 1:
-            longest = "the period" if blaze_ior else "twice the period"
-            raise RequestError(
-                f"blaze_wavelength: got {blaze_wavelength:g} nm, wanted less than {longest}, "
-                f"{blaze_wavelength / sine:.4g} nm"
-            )
-        facet = float(np.arcsin(sine) if blaze_ior is None else np.arctan(sine / (blaze_ior - np.sqrt(1 - sine**2))))
     used = "" if blaze_ior is None else f" in transmission, n = {blaze_ior:g}"
     source = f"ruled grating, {lines_per_mm:g} lines/mm, blazed for {blaze_wavelength:.4g} nm{used}"
     depth = period * np.tan(facet)
     check_profile(period, depth, samples)
     return one_row(depth * phase(samples), period, f"{source} ({np.degrees(facet):.2f}°)")
+
+
+def _blaze_angle(period: float, wavelength: float, ior: float | None) -> float:
+    """Return θ_B of `ruled` in radians, for a period in µm and a blaze wavelength in nm."""
+    check_positive("blaze_wavelength", wavelength, "of nm")
+    if wavelength < 10:
+        raise RequestError(f"blaze_wavelength: got {wavelength:g} nm, wanted at least 10 nm, not µm")
+    sine = wavelength * 1e-3 / (period if ior else 2 * period)
+    if sine >= 1:
+        longest = "the period" if ior else "twice the period"
+        raise RequestError(
+            f"blaze_wavelength: got {wavelength:g} nm, wanted less than {longest}, {wavelength / sine:.4g} nm"
+        )
+    return float(np.arcsin(sine) if ior is None else np.arctan(sine / (ior - np.sqrt(1 - sine**2))))
 
 
 def right_angled(period: float, facet_angle: float, *, samples: int = 512) -> HeightField:

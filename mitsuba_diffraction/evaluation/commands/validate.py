@@ -14,7 +14,7 @@ from ...files import outputs
 from ...precomputation.recipe import Recipe
 from ...precomputation.requested_surface import RequestedSurface
 from ...progress import progress_bar, show, tell
-from ..record import Check
+from ..record import Record
 
 
 def validate(
@@ -37,7 +37,6 @@ def validate(
     from ...render.scene_file import SceneFile
     from ...variants import choose_variant
     from .. import report
-    from ..validation.checks import checks
     from ..validation.scene_pictures import compare_scene
 
     chosen = choose_variant(variant)
@@ -57,12 +56,7 @@ def validate(
             comparison = compare_scene(scene, progress)
         results = comparison.records
     else:
-        these = checks() if recipe is None else _surface_checks(recipe)
-        results = []
-        with progress_bar("validation") as progress:
-            for check in these:
-                results.append(check.run())
-                progress(len(results), len(these))
+        results = _results(recipe)
     show(report.record_table(results), width=120)
     if scene is not None:
         tell(str(comparison))
@@ -80,13 +74,23 @@ def validate(
         raise RuntimeError(f"{len(missed)} of {promised} checks missed: {'; '.join(missed)}")
 
 
-def _surface_checks(recipe: Recipe) -> tuple[Check, ...]:
+def _results(recipe: Recipe | None) -> list[Record]:
+    """Return the results of the checks of a surface, or, without one, of all others."""
     from ...precomputation.grating_spectrum import GratingSpectrum
-    from ..validation.checks import surface_checks
+    from ..validation.checks import checks, surface_checks
 
-    spectrum = recipe.cached(progress_bar)
-    assert isinstance(spectrum, GratingSpectrum)  # `_recipe` refuses rigorous theory
-    return surface_checks(recipe.height_field(), spectrum)
+    if recipe is None:
+        these = checks()
+    else:
+        spectrum = recipe.cached(progress_bar)
+        assert isinstance(spectrum, GratingSpectrum)  # `_recipe` refuses rigorous theory
+        these = surface_checks(recipe.height_field(), spectrum)
+    results: list[Record] = []
+    with progress_bar("validation") as progress:
+        for check in these:
+            results.append(check.run())
+            progress(len(results), len(these))
+    return results
 
 
 def _recipe(requested: RequestedSurface) -> Recipe:

@@ -87,13 +87,16 @@ def is_jpk(path: Path) -> bool:
     return False
 
 
-def _archive(path: Path) -> io.BytesIO:
-    """Return an archive whose members are as long as they are declared."""
+def _opened(path: Path) -> zipfile.ZipFile:
     try:
-        archive = zipfile.ZipFile(path)
+        return zipfile.ZipFile(path)
     except BAD_ARCHIVE as error:
         raise RequestError(f"a damaged archive ({error})") from None
-    with archive:
+
+
+def _archive(path: Path) -> io.BytesIO:
+    """Return an archive whose members are as long as they are declared."""
+    with _opened(path) as archive:
         return _packed(unpacked_members(archive, archive.namelist(), path.stat().st_size))
 
 
@@ -107,11 +110,7 @@ def _packed(members: Mapping[str, bytes]) -> io.BytesIO:
 
 
 def _jpk_image(path: Path) -> bytes:
-    try:
-        archive = zipfile.ZipFile(path)
-    except BAD_ARCHIVE as error:
-        raise RequestError(f"a damaged archive ({error})") from None
-    with archive:
+    with _opened(path) as archive:
         if (image := next((name for name in archive.namelist() if name in _JPK_IMAGES), None)) is None:
             raise RequestError(
                 f"an archive without an image of the heights ({' or '.join(_JPK_IMAGES)}): save that image with "
