@@ -29,6 +29,7 @@ from ..variants import is_supported
 from .parser_state import children_of, resolved_file
 from .scene import instantiated, move_first_sensor, replace_path, unwrap_integrators
 from .scene_light import draw_wavelengths_of_lights
+from .scene_limits import check_depth, check_nesting
 from .scene_materials import Materials, check_materials, replace_materials, warn_of_unused_materials
 from .scene_numbers import read_numbers
 from .spectral_film import replace_films
@@ -101,7 +102,11 @@ class SceneFile:
         folders.prepend(str(path.resolve().parent))
         with self._searching(folders):
             config = _config()
+            check_nesting(path.resolve(), self.parameters)
             state = mi.parser.parse_file(config, str(path.resolve()), **self.parameters)
+            resolved = mi.parser.ParserState(state)
+            mi.parser.transform_resolve(config, resolved)
+            check_depth(resolved)
             if self.materials:
                 mi.parser.transform_resolve(config, state)
                 replace_materials(state, self.materials)
