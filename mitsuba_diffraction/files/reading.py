@@ -69,9 +69,9 @@ def check_file(path: str | os.PathLike[str], max_bytes: float = MAX_FILE_BYTES) 
         raise RequestError(f"{name}: got a file of {bytes_text(size)}, wanted at most {bytes_text(max_bytes)}")
 
 
-def read_bytes(path: str | os.PathLike[str], max_bytes: int = MAX_FILE_BYTES) -> bytes:
+def read_bytes(path: str | os.PathLike[str]) -> bytes:
     """Return the content of a file; for errors see `check_file`."""
-    check_file(path, max_bytes)
+    check_file(path)
     return Path(path).read_bytes()
 
 

@@ -248,7 +248,7 @@ def order_efficiencies(
     wavelengths: ArrayLike,
     azimuth: float,
     theory: str,
-    progress: Progress = silent,
+    progress: Progress,
 ) -> OrderEfficiencies:
     """Compute `efficiencies` of a grating in its media; the same arguments, errors and warnings."""
     wavelengths = checked_numbers("wavelengths", wavelengths, "nm from 10 to 100000 (100 µm)", 9.999, 100_000.001)

@@ -91,7 +91,7 @@ def efficiencies_of_peaks(
     angles: ArrayLike,
     wavelengths: ArrayLike,
     azimuth: float,
-    progress: Progress = silent,
+    progress: Progress,
 ) -> PeakEfficiencies:
     """Compute `peak_efficiencies` of a surface above a medium; the same arguments and errors."""
     angles, wavelengths = check_request(spectrum.wavelengths, angles, wavelengths, below)
