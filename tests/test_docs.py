@@ -34,8 +34,9 @@ REDUCED = {
     "compare": {"--width": "16", "--spp": "1", "--no-shares": None},
 }
 """Options that make a command quick, instead of those that it has."""
-SHOWN = {"text", "bash", "math"}
-"""What is shown and not run: output, what needs several machines (tests/render/test_cluster.py), and formulas."""
+SHOWN = {"text", "bash", "math", "js"}
+"""What is shown and not run: output, what needs several machines (tests/render/test_cluster.py) or a browser
+(tests/export), and formulas."""
 BY_OTHER_MEANS = (
     *("python3 -m venv", "python -m pytest", "pip install", "jupyter ", "mkdocs "),
     *("mitsuba-diffraction benchmark", "mitsuba-diffraction convergence", "mitsuba-diffraction validate"),

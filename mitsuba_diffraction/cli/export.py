@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
 from typing import Annotated
@@ -9,6 +10,8 @@ from typing import Annotated
 import typer
 
 from ..errors import RequestError
+from ..export.colour_file import check_base, write_colours
+from ..export.colour_table import Viewed
 from ..export.cycles import write_shader
 from ..export.exported_grating import ExportedGrating
 from ..export.lswm import write_lswm
@@ -20,6 +23,8 @@ from ..precomputation.grating_spectrum import GratingSpectrum
 from ..precomputation.requested_surface import RequestedSurface
 from ..progress import progress_bar, say, tell
 from ..scalar_theory.validity import scalar_error
+from ..settings import VISIBLE, wavelengths_inside
+from ..viewer.viewed_surface import in_scene, with_plastic
 from .arguments import (
     KEYS_OF_RECIPES,
     SURFACE,
@@ -35,6 +40,8 @@ _OF_MATERIAL = ("theory", "material", "int_ior")
 _INPUTS = {"orientation": "Orientation", "height_scale": "HeightScale", "base": "BaseColor"}  # of the shader
 _IN_SCENES = ("coat_ior", "thin_film_ior", "thin_film_thickness", "transmission", "ext_ior", "lateral_scale", *_INPUTS)
 _SHADERS = {".osl": write_shader, ".npz": write_node_tables}
+_COLOURS = ".bin"
+_OF_COLOURS = ("coat_ior", *_INPUTS)  # that it holds, beside the material
 _RANGES = {
     ".csv": {"wavelength": "400:700:10", "angle": "0:80:5", "azimuth": "0"},
     ".json": {"wavelength": "450:650:50", "angle": "0:80:10", "azimuth": "0:360:30"},
@@ -46,7 +53,7 @@ def export(
         str,
         typer.Argument(
             metavar=SURFACE,
-            help="a recipe (.toml), a profile, a scan, or for .osl and .npz a saved spectrum (.exr); "
+            help="a recipe (.toml), a profile, a scan, or for .bin, .osl and .npz a saved spectrum (.exr); "
             f"{KEYS_OF_RECIPES}, theory, material, int_ior",
         ),
     ],
@@ -55,8 +62,8 @@ def export(
         typer.Option(
             "-o",
             "--output",
-            help=".osl: a shader for Blender's Cycles; .npz: its tables, for Blender's own nodes; .csv: the orders as "
-            "a table; .json: a grating for Zemax OpticStudio and Speos",
+            help=".osl: a shader for Blender's Cycles; .npz: its tables, for Blender's own nodes; .bin: colours for "
+            "three.js; .csv: the orders as a table; .json: a grating for Zemax OpticStudio and Speos",
         ),
     ],
     wavelength: Annotated[
@@ -76,15 +83,15 @@ def export(
 ) -> None:
     """Write a surface for another program."""
     requested = RequestedSurface.of(surface, aside=(*_OF_MATERIAL, *_IN_SCENES))
-    check_suffix("-o", output, *_SHADERS, *_RANGES)
+    check_suffix("-o", output, _COLOURS, *_SHADERS, *_RANGES)
     ranges = {"wavelength": wavelength, "angle": angle, "azimuth": azimuth}
     given = {key: text for key, text in ranges.items() if text is not None}
     _refuse_parameters_of_scenes(requested, output)
     check_outputs(requested.files, [("-o", output)], overwrite=overwrite)
-    if output.suffix.lower() in _SHADERS:
+    if output.suffix.lower() not in _RANGES:
         if given:
             raise RequestError(f"--{', --'.join(given)}: {output} holds all directions and colours, wanted it without")
-        _write_shader(requested, output)
+        (_write_colours if output.suffix.lower() == _COLOURS else _write_shader)(requested, output)
     elif requested.is_spectrum:
         raise RequestError(f"{surface}: got a saved spectrum for {output}, wanted the recipe, the profile or the scan")
     else:
@@ -93,9 +100,9 @@ def export(
 
 def _refuse_parameters_of_scenes(requested: RequestedSurface, output: Path) -> None:
     """Refuse parameters of the plugin that files for other programs do not hold, and say what does."""
-    is_shader = output.suffix.lower() in _SHADERS
+    is_shader, has_colours = output.suffix.lower() in _SHADERS, output.suffix.lower() == _COLOURS
     for key in _IN_SCENES:
-        if key in requested.aside:
+        if key in requested.aside and not (has_colours and key in _OF_COLOURS):
             instead = f"set the input {_INPUTS[key]} of the shader" if is_shader and key in _INPUTS else ""
             instead = instead or "wanted it without; scenes and `render --material` have it"
             raise RequestError(f"{key}: got {requested.aside[key]}, which {output} does not hold; {instead}")
@@ -120,6 +127,44 @@ def _write_shader(requested: RequestedSurface, output: Path) -> None:
     if spectrum.warning:
         tell(f"! {spectrum.warning}")
     tell(f"{output}: {spectrum.source}; {tables.held}")
+
+
+def _write_colours(requested: RequestedSurface, output: Path) -> None:
+    title = requested.title
+    if requested.theory != "scalar":
+        raise RequestError(
+            f"{title}: got theory={requested.theory}, and a file of colours holds scalar theory: wanted theory=scalar, "
+            "or a file .csv or .json"
+        )
+    own = {name: value for name, value in requested.aside.items() if name not in ("theory", "base")}
+    saved = requested.is_spectrum
+    shown = in_scene(own if saved else with_plastic(requested.recipe, own, covered=True))
+    coat, scale = shown.media.coat_index, max(1.0, shown.height_scale)
+    base = None if (stated := requested.aside.get("base")) is None else str(stated)
+    check_base(base, shown.media.below)
+    requested.say_extent()
+    progress = partial(progress_bar, unit="%")
+    if saved:
+        spectrum = requested.spectrum()
+        if (found := VISIBLE[0] / spectrum.wavelengths[0]) < coat * scale * (1 - 1e-6):
+            raise RequestError(
+                f"{title}: got coat_ior and height_scale of {coat * scale:.4g} in all, wanted at most {found:.4g}, for "
+                "which the spectrum was built; wanted its recipe, profile or scan"
+            )
+    else:
+        recipe = requested.recipe
+        if recipe.settings.wavelengths == VISIBLE:
+            settings = replace(recipe.settings, wavelengths=wavelengths_inside(coat, scale))
+            recipe = replace(recipe, settings=settings)
+        spectrum = recipe.cached(progress)
+    assert isinstance(spectrum, GratingSpectrum)
+    viewed = Viewed(spectrum, shown.media.below, coat, shown.height_scale)
+    colours = write_colours(viewed, output, shown.orientation, base)
+    if spectrum.warning:
+        tell(f"! {spectrum.warning}")
+    if not colours.error.is_small:
+        tell(f"! {title}: the file errs by more than most: {colours.error}")
+    tell(f"{output}: {spectrum.source}; {output.stat().st_size / 1e6:.1f} MB, {colours.error}")
 
 
 def _write_orders(requested: RequestedSurface, output: Path, given: dict[str, str]) -> None:

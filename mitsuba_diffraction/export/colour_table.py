@@ -307,7 +307,8 @@ def _orders(viewed: Viewed) -> OrderColours:
     length = np.linalg.norm(q, axis=-1)
     kept = (powers.max(axis=-1) > _MIN_POWER) & (length <= _MAX_U / (_SHORTEST * 1e-3))
     if (count := int(kept.sum())) > MAX_ORDERS:
-        raise RequestError(f"{spectrum.source}: got {count} separate orders, wanted at most {MAX_ORDERS}")
+        wanted = f"wanted at most {MAX_ORDERS}; with a smaller coherence_length they overlap"
+        raise RequestError(f"{spectrum.source}: got {count} separate orders, {wanted}")
     row, column = np.argwhere(length == 0)[0]
     kept[row, column] = False
     narrow, wide = _WIDTH_RANGE

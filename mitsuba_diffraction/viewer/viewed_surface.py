@@ -136,7 +136,7 @@ class Surface:
             progress: of the computation.
             command: as the attribute.
         """
-        shown = in_scene(_with_plastic(recipe, parameters, covered=not command))
+        shown = in_scene(with_plastic(recipe, parameters, covered=not command))
         if recipe.settings.theory == "rigorous":  # before its table is computed
             raise RequestError(f"{name}: got theory=rigorous, wanted a surface of scalar theory")
         if not command and shown.coat_ior > 1 and recipe.settings.wavelengths == VISIBLE:
@@ -199,7 +199,7 @@ OF_SCENE = ("theory", *_SHOWN, *_NOT_SHOWN)
 """Names of what a scene says of a grating, beside the values of its recipe."""
 
 
-def _with_plastic(recipe: Recipe, parameters: Mapping[str, Any], covered: bool) -> dict[str, Any]:
+def with_plastic(recipe: Recipe, parameters: Mapping[str, Any], covered: bool) -> dict[str, Any]:
     """Return the parameters of a material, and for a disc its own where they are not given.
 
     Args:

@@ -1,0 +1,229 @@
+"""The material for three.js in a real browser, beside the colours of the table and a sum over a lit plane."""
+
+import functools
+import http.server
+import json
+import shutil
+import threading
+from pathlib import Path
+
+import numpy as np
+import pytest
+from test_colour_table import directions, face, viewed
+
+from mitsuba_diffraction.export import colour_file
+from mitsuba_diffraction.export.colour_file import write_colours
+from mitsuba_diffraction.optics.color import SRGB_TO_XYZ, XYZ_to_linear_sRGB, auto_exposure, delta_E, into_gamut
+
+sync_api = pytest.importorskip("playwright.sync_api", reason="the package playwright is not installed")
+
+CHROMIUM = shutil.which("chromium")
+THREE = Path(__file__).parents[2] / "node_modules" / "three"
+MODULE = Path(colour_file.__file__).parent / "assets" / "three"
+OPTIONS = ["--use-angle=swiftshader", "--enable-unsafe-swiftshader", "--no-sandbox"]
+PAGE = """<!doctype html><meta charset="utf-8"><link rel="icon" href="data:,"><script type="importmap">{"imports": {
+"three": "./three/build/three.webgpu.js", "three/webgpu": "./three/build/three.webgpu.js",
+"three/tsl": "./three/build/three.tsl.js"}}</script><script type="module" src="page.js"></script>"""
+
+
+class Quiet(http.server.SimpleHTTPRequestHandler):
+    """Modules are not loaded from files."""
+
+    def log_message(self, *_):
+        """Say nothing."""
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory):
+    """The folder of the page, with the module and three.js."""
+    if not THREE.is_dir():
+        pytest.skip("three.js is not installed (npm install --no-save three, in the checkout)")
+    path = tmp_path_factory.mktemp("three")
+    (path / "three").symlink_to(THREE)
+    (path / "module").symlink_to(MODULE)
+    (path / "index.html").write_text(PAGE, encoding="utf-8")
+    shutil.copy(Path(__file__).with_name("page_with_material.js"), path / "page.js")
+    return path
+
+
+@pytest.fixture(scope="module")
+def tab(folder):
+    """The page in chromium with its software renderer; its messages are collected in `messages`."""
+    if CHROMIUM is None:
+        pytest.skip("chromium is not installed (apt-get install chromium)")
+    server = http.server.ThreadingHTTPServer(("127.0.0.1", 0), functools.partial(Quiet, directory=folder))
+    threading.Thread(target=server.serve_forever, daemon=True).start()
+    with sync_api.sync_playwright() as playwright:
+        browser = playwright.chromium.launch(executable_path=CHROMIUM, args=OPTIONS)
+        page = browser.new_page()
+        page.messages = []
+        page.on("console", lambda message: page.messages.append(message.text))
+        page.on("pageerror", lambda error: page.messages.append(str(error)))
+        page.set_default_timeout(240_000)
+        page.goto(f"http://127.0.0.1:{server.server_port}/index.html")
+        page.wait_for_function("window.isReady")
+        yield page
+        browser.close()
+    server.shutdown()
+    server.server_close()
+
+
+def call(tab, function, *arguments):
+    """Call a function of the page; texels as (n, 4)."""
+    text = tab.evaluate(f"async (text) => JSON.stringify(await {function}(...JSON.parse(text)))", json.dumps(arguments))
+    return np.array(json.loads(text)).reshape(-1, 4)
+
+
+def f_cos(surface, colours, wi, wo):
+    """K G T_i T_o C cos θ_i, XYZ (n, 3); directions (n, 3)."""
+    n = surface.coat
+    ki, ko = (np.sqrt(n**2 - (d[:, :2] ** 2).sum(axis=1)) for d in (wi, wo))
+    u, w = -(wi + wo)[:, :2], ki + ko
+    v = np.concatenate([u, w[:, None]], axis=1)
+    inner = [np.concatenate([-d[:, :2], k[:, None]], axis=1) for d, k in ((wi, ki), (wo, ko))]
+    along = [(v * d).sum(axis=1) for d in inner]
+    half = w / np.linalg.norm(v, axis=1)
+    k = along[0] * along[1] / (ki * ko * w**2)
+    cosines = [a / (n * np.linalg.norm(v, axis=1)) for a in along]
+    g = np.minimum(1, np.minimum(2 * half * ki / n / cosines[0], 2 * half * ko / n / cosines[1]))
+    faces = face(wi[:, 2], n) * face(wo[:, 2], n) if n > 1 else 1
+    return colours.colour(u, w) * (k * g * faces * wi[:, 2])[:, None]
+
+
+def difference(found, wanted):
+    """ΔE00 of XYZ, (n,), exposed like a picture."""
+    exposure = auto_exposure(into_gamut(XYZ_to_linear_sRGB(wanted)))
+    return delta_E(exposure * found, exposure * wanted)
+
+
+@pytest.fixture(scope="module")
+def exported(folder):
+    """exported(name): surface and colours; the file is NAME.bin."""
+
+    @functools.cache
+    def of(name):
+        surface = viewed(name)
+        return surface, write_colours(surface, folder / f"{name.replace(' ', '_')}.bin")
+
+    return of
+
+
+SURFACES = ("blaze", "foil of gold", "skin", "compact disc")
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", SURFACES)
+def test_pairs_of_directions_have_the_colours_of_the_table(name, exported, tab):
+    surface, colours = exported(name)
+    wi, wo = directions(surface, 1000)
+    pairs = np.pad(np.stack([wi, wo], axis=1), ((0, 0), (0, 0), (0, 1)))
+    found = call(tab, "pairs", f"{name.replace(' ', '_')}.bin", pairs.ravel().tolist(), 0)[:, :3]
+    wanted = f_cos(surface, colours, wi, wo)
+    error = difference(found, wanted)
+    assert error.mean() < 0.5
+    assert np.percentile(error, 95) < 1.5
+    assert found.sum() == pytest.approx(wanted.sum(), rel=0.03)
+    assert not tab.messages
+
+
+SIZE, EYE = 24, np.array([0.4, -1.8, 3.0])
+
+
+def unit(v):
+    """Vectors of length one."""
+    return v / np.linalg.norm(v, axis=-1, keepdims=True)
+
+
+def seen():
+    """Points on z = 0 below the centres of pixels, (n, 3), by a perspective camera of 40° that looks at the origin."""
+    z = unit(EYE)
+    x = unit(np.cross([0, 1, 0], z))
+    y = np.cross(z, x)
+    at = (np.arange(SIZE) + 0.5) / SIZE * 2 - 1
+    across, up = (np.tan(np.deg2rad(20)) * a.ravel() for a in np.meshgrid(at, at))
+    rays = across[:, None] * x + up[:, None] * y - z
+    return EYE - rays * (EYE[2] / rays[:, 2])[:, None]
+
+
+def axes(points, orientation, radial):
+    """The pattern's axes at points, (n, 3, 3)."""
+    x = unit(points * [1, 1, 0]) if radial else np.tile([1.0, 0, 0], (len(points), 1))
+    y = np.cross([0, 0, 1.0], x)
+    angle = np.deg2rad(orientation)
+    z = np.tile([0, 0, 1.0], (len(points), 1))
+    return np.stack([np.cos(angle) * x + np.sin(angle) * y, np.cos(angle) * y - np.sin(angle) * x, z], axis=1)
+
+
+def mixed(XYZ):
+    """Colours outside of the gamut, mixed with grey of their luminance, as XYZ."""
+    rgb, luminance = XYZ_to_linear_sRGB(XYZ), XYZ[:, 1:2]
+    kept = np.minimum(luminance / np.maximum(luminance - rgb.min(axis=1, keepdims=True), 1e-12), 1)
+    return (luminance + (rgb - luminance) * kept) @ SRGB_TO_XYZ.T
+
+
+def lit(surface, colours, points, frame, position, light, radius=0.0, count=300):
+    """XYZ of the light of a lamp at points; the mean over a disc of an angular radius that is seen from each."""
+    local = lambda v: np.einsum("nij,nj->ni", frame, v)  # noqa: E731
+    wo, away = local(unit(EYE - points)), position - points * (light != "directional")
+    away = np.broadcast_to(away, points.shape)
+    distance = np.linalg.norm(away, axis=1)
+    to_lamp = unit(away)
+    a = unit(np.cross(to_lamp, [0, 0, 1.0] if light != "above" else [1.0, 0, 0]))
+    b = np.cross(to_lamp, a)
+    sine_of_edge = radius / distance if light != "directional" else np.full(len(points), np.sin(radius))
+    total = 0
+    for k in range(count if radius else 1):
+        sine, phi = np.sqrt((k + 0.5) / count) * sine_of_edge * (radius > 0), k * np.pi * (3 - np.sqrt(5))
+        across = a * np.cos(phi) + b * np.sin(phi)
+        wi = to_lamp * np.sqrt(1 - sine**2)[:, None] + across * sine[:, None]
+        total = total + f_cos(surface, colours, local(wi), wo) / (count if radius else 1)
+    return total / (1 if light == "directional" else distance[:, None] ** 2)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    ("name", "options"),
+    [
+        ("skin", {"light": "directional", "material": {"orientation": 30}}),
+        ("skin", {"light": "point", "lamp": {"radius": 0.3}, "instanced": True}),
+        ("blaze", {"light": "spot", "material": {"orientation": -20}}),
+        ("blaze", {"light": "point", "lamp": {"radius": 0.15}}),
+        ("foil of gold", {"light": "directional", "lamp": {"angularRadius": 0.035}, "material": {"radial": True}}),
+        ("compact disc", {"light": "directional", "material": {"orientation": "tangential"}}),
+    ],
+)
+def test_a_lit_plane_has_the_colours_of_its_directions(name, options, exported, tab):
+    surface, colours = exported(name)
+    position = np.array([-0.5, 2.1, 3.0])
+    shown = {"eye": EYE.tolist(), "position": position.tolist(), "size": SIZE, "material": {}, **options}
+    found = call(tab, "plane", f"{name.replace(' ', '_')}.bin", shown)[:, :3]
+    assert not tab.messages
+    points, orientation = seen(), shown["material"].get("orientation", 0)
+    radial = shown["material"].get("radial", orientation == "tangential")
+    frame = axes(points, 90 if orientation == "tangential" else orientation, radial)
+    lamp = shown.get("lamp", {})
+    radius = max(lamp.get("radius", 0), lamp.get("angularRadius", 0))
+    wanted = mixed(lit(surface, colours, points, frame, position, shown["light"], radius))
+    inside = (np.abs(points[:, :2]) < 0.9).all(axis=1) & (np.linalg.norm(points, axis=1) > 0.1)
+    found = (found @ SRGB_TO_XYZ.T)[inside]
+    error = difference(found, wanted[inside])
+    # Of a lamp the material takes 16 points, or a Gaussian of its variance, whose edges are soft.
+    assert error.mean() < (1 if radius else 0.3)
+    assert radius or np.percentile(error, 95) < 1.5
+    assert found.sum() == pytest.approx(wanted[inside].sum(), rel=0.03)
+
+
+@pytest.mark.slow
+def test_a_file_that_cannot_be_read_is_grey_and_says_so_once(exported, folder, tab):
+    exported("blaze")
+    content = (folder / "blaze.bin").read_bytes()
+    (folder / "short.bin").write_bytes(content[:-100])
+    (folder / "later.bin").write_bytes(content.replace(b'"version": 1', b'"version": 9'))
+    (folder / "other.bin").write_bytes(b"glTF" + content[4:])
+    shown = {"eye": EYE.tolist(), "position": [0, 0, 3], "size": 8, "material": {}, "light": "directional"}
+    wanted = {"short": "the file was cut short", "later": "version 9, wanted 1", "other": "not a file of colours"}
+    for name, problem in wanted.items():
+        grey = call(tab, "plane", f"{name}.bin", shown)[27, :3]
+        assert np.ptp(grey) < 1e-3 < grey.min()
+        assert tab.messages == [f"DiffractionMaterial: {name}.bin: {problem}; shown in grey"]
+        tab.messages.clear()
