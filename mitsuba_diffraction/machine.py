@@ -13,11 +13,11 @@ _MAX_THREADS = 8
 
 
 def available_memory() -> int | None:
-    """Return the number of bytes that this process can allocate; None if unknown (Linux alone says it).
+    """Return the number of bytes that this process can allocate; None if unknown, as on systems other than Linux.
 
-    That is the least of what the machine has, swap included, of what the control groups of the process leave (those of
-    containers, Slurm and systemd, version 2 or 1; pages of files that can be dropped count as free), and of what the
-    limit of its address space leaves (`ulimit -v`).
+    It is the minimum of three: what the machine has available, swap included; what the control groups of the process
+    leave, those of containers, Slurm and systemd, version 2 or 1, where pages of files that can be dropped count as
+    free; and what the limit of its address space leaves (`ulimit -v`).
     """
     limits = [_memory_of_machine(), _address_space()]
     for folder in _control_groups("memory"):

@@ -46,7 +46,7 @@ def of_memory(group, limit, usage, stat=""):
         ("0::/\n", of_memory("", "max\n", "1000000000\n"), 8.192),
         # Pages of files can be dropped.
         ("0::/\n", of_memory("", "3000000000", "2500000000", "anon 1\ninactive_file 500000000\n"), 1),
-        # The least of a group and those around it, of which more is used than allowed.
+        # The minimum over a group and those around it, of which one uses more than is allowed.
         ("0::/a/b\n", of_memory("a/b", "max", "1") | of_memory("a", "5000000000", "6000000000"), 0),
         # Version 1, of a group that is not visible under its outer path.
         (
