@@ -199,6 +199,7 @@ def test_the_documentation_names_the_scenes_that_request_denoising():
             "beetle",
             "blaze",
             "scan",
+            "xenopeltis",
             "projection",
         )
     }
