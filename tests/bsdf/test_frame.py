@@ -320,12 +320,15 @@ def test_the_centre_of_a_radial_pattern_is_finite():
     assert np.isfinite(world(si, bsdf, [(0.1, 0.2, 0.97)])).all()
 
 
-@pytest.mark.parametrize(("suffix", "value"), [("png", 51), ("exr", 72.0)])
+@pytest.mark.parametrize(
+    ("suffix", "value"),
+    [("png", np.uint8(51)), ("png", np.uint16(13107)), ("exr", np.float32(72)), ("exr", np.float16(72))],
+)
 def test_an_orientation_is_read_from_a_picture(suffix, value, tmp_path):
     """White is 360° in a PNG: 51/255 of it are 72°."""
     cos, sin = np.cos(np.deg2rad(72)), np.sin(np.deg2rad(72))
     path = tmp_path / f"turn.{suffix}"
-    mi.Bitmap(np.full((4, 4), value, np.uint8 if suffix == "png" else np.float32)).write(str(path))
+    mi.Bitmap(np.full((4, 4), value)).write(str(path))
     check(mesh(SQUARE), (0.4, 0.2, 2), DOWN, (0, 0, 1), (cos, sin, 0), (-sin, cos, 0), str(path))
 
 

@@ -480,7 +480,10 @@ def pairs(case: Case, count=200):
 
 
 def is_reciprocal(case: Case):
-    for wi, wo, texel in pairs(case):
+    # Of scales that vary, at each texel.
+    texels = range(4) if any(isinstance(getattr(case.c, name), tuple) for name in TEXTURES) else [None]
+    for (wi, wo, own), other in itertools.product(pairs(case), texels):
+        texel = own if other is None else other
         n_i, n_o = (case.outer(omega) for omega in (wi, wo))
         there = case.evaluate(wi, wo, texel, case.importance)[0] / (np.abs(wo[:, [2]]) * n_o**2)
         back = case.evaluate(wo, wi, texel, case.importance)[0] / (np.abs(wi[:, [2]]) * n_i**2)
@@ -494,7 +497,9 @@ def is_reciprocal(case: Case):
         bad = np.abs(there - back) > relative[:, None] * scale + floor
         j = np.argmax(bad.any(-1))
         case.require(
-            not bad.any(), "(d) reciprocity", wi=wi[j], wo=wo[j], there=there[j], back=back[j], count=bad.sum()
+            not bad.any(),
+            "(d) reciprocity",
+            **{"wi": wi[j], "wo": wo[j], "texel": texel, "there": there[j], "back": back[j], "count": bad.sum()},
         )
         # Polarised variants multiply the faces in another order, with other rounding errors.
         floor = 1e-6 * scale.max(initial=0) + 1e-7 + rounding[:, None]

@@ -1,7 +1,7 @@
 """Random scenes, judged by the comparison of `mitsuba-diffraction validate SCENE`, with independent seeds.
 
-Each is a file of XML, loaded once for `diffraction_path` and once for Mitsuba's integrator. A seed gives the same
-scene. It draws
+Each is a file of XML, loaded once for `diffraction_path` and once for Mitsuba's integrator; and twice more, for a frame
+after an update of some parameters, with or without a frame before it. A seed gives the same scene. It draws
 
 - one or two gratings: line profiles, skins with a continuum; of metals, dielectrics, with a film, a coat,
   a base, transmission as interface or sheet; bare or in `twosided`, `mask`, `blendbsdf`, `normalmap`, `bumpmap`; turned
@@ -11,8 +11,8 @@ scene. It draws
 - a floor, at times a wall that shares its BSDF (which Mitsuba merges), and at times another object: `diffuse` with
   each kind of spectrum and texture, `plastic`, `roughplastic`, `conductor`, `roughconductor`, `dielectric`,
   `roughdielectric`, `thindielectric`, `principled`, `null`, `mask`, `blendbsdf`, `twosided`, `normalmap`, `bumpmap`
-- one to three lights: `area` on each shape and with a texture, `constant`, `envmap`, `sunsky`, `directional`, `point`,
-  `spot`, `projector`
+- one to three lights of several `sampling_weight`s: `area` on each shape and with a texture, `directionalarea`,
+  `constant`, `envmap`, `sunsky`, `directional`, `point`, `spot`, `projector`
 - `perspective`, at times with a shifted principal point, `thinlens`, `orthographic`; each sampler and filter of
   reconstruction; a crop window; depths from 2 to 6 or no limit, with Russian roulette from 3 or 5.
 
@@ -22,6 +22,7 @@ Lobes are wide, and lamps that are seen in mirrors large, so that `path` converg
 from __future__ import annotations
 
 import functools
+import re
 from pathlib import Path
 
 import drjit as dr
@@ -274,12 +275,17 @@ class RandomScene:
         return found
 
     # ------------------------------------------------------------------ lights
-    def light(self, kind):
+    def light(self, kind, weight):
         position = [self.uniform(-2, 2), self.uniform(-2.5, 1), self.uniform(2.5, 4)]
         look = looking(position, [self.uniform(-0.5, 0.5), self.uniform(-0.5, 0.5), 0.5], (0.1, 1, 0.2))
+        of = {} if weight == 1 else {"sampling_weight": weight}
+        if kind == "directionalarea":
+            facing = to_world(f'<scale value="{self.uniform(0.5, 1.2)}"/>', look)
+            emitter = plugin("emitter", kind, self.colour("radiance", 3.0, False), **of)
+            return plugin("shape", self.pick("rectangle", "disk"), facing, emitter)
         if kind == "area":
             varies = self.chance(0.3)
-            emitter = plugin("emitter", "area", self.colour("radiance", 1.0 if varies else 3.0, varies))
+            emitter = plugin("emitter", "area", self.colour("radiance", 1.0 if varies else 3.0, varies), **of)
             size = self.uniform(0.5, 1.2)
             if self.chance(0.5):
                 facing = to_world(f'<scale value="{size}"/>', look)
@@ -288,32 +294,38 @@ class RandomScene:
             kinds = ("sphere", "cylinder", "cube", "ply")
             return self.shape(size, self.uniform(2.5, 4), *bsdf, emitter, kinds=kinds)
         if kind == "constant":
-            return plugin("emitter", kind, self.colour("radiance", 0.3, varies=False))
+            return plugin("emitter", kind, self.colour("radiance", 0.3, varies=False), **of)
         if kind == "envmap":
             values = self.rng.uniform(0, 0.2, (16, 32, 3))
             values[2:6, 8:14] = self.uniform(1, 3)
-            return plugin("emitter", kind, filename=self.picture(values))
+            return plugin("emitter", kind, filename=self.picture(values), **of)
         if kind == "sunsky":  # with a sun so wide that `path` finds it in a grating
             sun = vector("vector", [self.uniform(-1, 1), -0.5, 0.9], "sun_direction")
             scales = {"sun_scale": self.pick(0.0, 0.05), "sky_scale": 0.1, "sun_aperture": 8.0}
-            return plugin("emitter", kind, sun, **scales)
+            return plugin("emitter", kind, sun, **scales, **of)
         if kind == "directional":
             direction = vector("vector", [self.uniform(-0.6, 0.6), self.uniform(0, 0.6), -0.8], "direction")
-            return plugin("emitter", kind, direction, self.colour("irradiance", 1.0, varies=False))
+            return plugin("emitter", kind, direction, self.colour("irradiance", 1.0, varies=False), **of)
         if kind == "point":
-            return plugin("emitter", kind, vector("point", position, "position"), self.colour("intensity", 6.0, False))
+            return plugin(
+                "emitter", kind, vector("point", position, "position"), self.colour("intensity", 6.0, False), **of
+            )
         if kind == "spot":
             angle = self.uniform(15, 35)
-            return plugin("emitter", kind, to_world(look), self.colour("intensity", 8.0, False), cutoff_angle=angle)
+            return plugin(
+                "emitter", kind, to_world(look), self.colour("intensity", 8.0, False), cutoff_angle=angle, **of
+            )
         picture = plugin("texture", "bitmap", name="irradiance", filename=self.picture(self.rng.random((4, 4, 3))))
-        return plugin("emitter", kind, to_world(look), picture, fov=self.uniform(20, 45))
+        return plugin("emitter", kind, to_world(look), picture, fov=self.uniform(20, 45), **of)
 
     def lights(self):
         skies = ["constant", "envmap", "sunsky"]
-        kinds, found = ["area", "area", "directional", "point", "spot", "projector", *skies], ""
-        for _ in range(self.pick(1, 1, 2, 3)):
+        kinds = ["area", "area", "directionalarea", "directional", "point", "spot", "projector", *skies]
+        found = ""
+        for number in range(self.pick(1, 1, 2, 3)):
             kind = self.pick(*kinds)
-            found += self.light(kind)
+            # A scene draws at least one lamp.
+            found += self.light(kind, self.pick(1.0, 1.0, 0.3, 4.0, 0.0 if number else 1.0))
             kinds = [other for other in kinds if kind not in skies or other not in skies]
         return found
 
@@ -370,16 +382,61 @@ def _is_path(path: Path) -> bool:
     return scene.integrator().parts(scene, scene.sensors()[0])[0] is scene.integrator().path
 
 
+# Ends of the names of parameters, and what an update makes of their values.
+UPDATES = {
+    "radiance.value": lambda value: 0.3 * value,
+    "intensity.value": lambda value: 3.0 * value,
+    "irradiance.value": lambda value: 3.0 * value,
+    "reflectance.value": lambda value: 0.5 * value,
+    "sampling_weight": lambda value: 4.0 * value,
+    "height_scale": lambda value: 0.6 * value,
+    "orientation.value": lambda value: value + 30.0,
+    "to_world": lambda value: mi.Transform4f().translate([0.1, -0.05, 0.15]) @ value,
+}
+
+
+def update(scene: mi.Scene, seed: int) -> list[str]:
+    """Change one to three parameters of a scene; return their names.
+
+    They are chosen by their position: names of objects without an id are addresses, and differ between loads.
+    """
+    rng, parameters = np.random.default_rng(seed), mi.traverse(scene)
+    known = [(key, end) for key in parameters.keys() for end in UPDATES if f".{key}".endswith(f".{end}")]  # noqa: SIM118
+    chosen = [known[k] for k in rng.permutation(len(known))[: rng.integers(1, 4)]]
+    for name, end in chosen:
+        parameters[name] = UPDATES[end](parameters[name])
+    parameters.update()
+    return [re.sub(r"\d{6,}", "", name) for name, _ in chosen]
+
+
+def judge_update(seed: int, path: Path) -> None:
+    """Compare a frame after an update with that of the scene loaded anew, where no frame came before the update."""
+    frames, names = [], []
+    for has_frame_before in (True, False):
+        scene = SceneFile(path).load()
+        if has_frame_before:
+            mi.render(scene, spp=1, seed=7)
+        names.append(update(scene, seed))
+        frames.append(np.array(mi.render(scene, spp=4, seed=8)))
+    found, wanted = frames
+    assert names[0] == names[1], f"{path}: updates of {names}"
+    # Positions may differ by rounding, by which a few paths meet another surface.
+    same = np.isclose(found, wanted, rtol=1e-3, atol=1e-4 * np.abs(wanted).max()).mean()
+    assert found.shape == wanted.shape, f"{path}: update of {names[0]}"
+    assert same > 0.97, f"{path}: update of {names[0]}: {same:.2f} of the pixels are those of a scene loaded anew"
+
+
 def judge_scene(seed: int, folder: Path, files: dict[str, Path]) -> SceneComparison:
     """Compare the pictures of a scene; again, longer and with other seeds, if they differ.
 
     The reference may miss rare bright paths, and then underestimates its own error.
 
     Raises:
-        AssertionError: if the scene differs both times, with the file that was written.
+        AssertionError: if the scene differs both times, or after an update, with the file that was written.
     """
     mi.set_variant("llvm_ad_spectral")
     path = scene_of(seed, folder, files)
+    judge_update(seed, path)
     found = compare_scene(SceneFile(path), seconds=SECONDS)
     if not found.difference.is_noise and found.reference == "prb" and _is_path(path):
         return found  # with the fault of `path` behind null interactions
