@@ -99,7 +99,7 @@ def export(
 
 
 def _refuse_parameters_of_scenes(requested: RequestedSurface, output: Path) -> None:
-    """Refuse parameters of the plugin that files for other programs do not hold, and say what does."""
+    """Refuse parameters of the plugin that files for other programs do not hold, and name what does."""
     is_shader, has_colours = output.suffix.lower() in _SHADERS, output.suffix.lower() == _COLOURS
     for key in _IN_SCENES:
         if key in requested.aside and not (has_colours and key in _OF_COLOURS):
@@ -108,13 +108,17 @@ def _refuse_parameters_of_scenes(requested: RequestedSurface, output: Path) -> N
             raise RequestError(f"{key}: got {requested.aside[key]}, which {output} does not hold; {instead}")
 
 
-def _write_shader(requested: RequestedSurface, output: Path) -> None:
-    title = requested.title
+def _check_scalar(requested: RequestedSurface, what: str) -> None:
     if requested.theory != "scalar":
         raise RequestError(
-            f"{title}: got theory={requested.theory}, and a shader for Cycles holds scalar theory: wanted "
-            "theory=scalar, or a file .csv or .json"
+            f"{requested.title}: got theory={requested.theory}, and {what} holds scalar theory: wanted theory=scalar, "
+            "or a file .csv or .json"
         )
+
+
+def _write_shader(requested: RequestedSurface, output: Path) -> None:
+    title = requested.title
+    _check_scalar(requested, "a shader for Cycles")
     requested.say_extent()
     progress = partial(progress_bar, unit="%")
     saved = requested.is_spectrum
@@ -131,11 +135,7 @@ def _write_shader(requested: RequestedSurface, output: Path) -> None:
 
 def _write_colours(requested: RequestedSurface, output: Path) -> None:
     title = requested.title
-    if requested.theory != "scalar":
-        raise RequestError(
-            f"{title}: got theory={requested.theory}, and a file of colours holds scalar theory: wanted theory=scalar, "
-            "or a file .csv or .json"
-        )
+    _check_scalar(requested, "a file of colours")
     own = {name: value for name, value in requested.aside.items() if name not in ("theory", "base")}
     saved = requested.is_spectrum
     shown = in_scene(own if saved else with_plastic(requested.recipe, own, covered=True))
@@ -163,7 +163,7 @@ def _write_colours(requested: RequestedSurface, output: Path) -> None:
     if spectrum.warning:
         tell(f"! {spectrum.warning}")
     if not colours.error.is_small:
-        tell(f"! {title}: the file errs by more than most: {colours.error}")
+        tell(f"! {title}: the colours of the file are less exact than usual: {colours.error}")
     tell(f"{output}: {spectrum.source}; {output.stat().st_size / 1e6:.1f} MB, {colours.error}")
 
 

@@ -126,13 +126,13 @@ class ColourError:
 
     Attributes:
         mean: of the pairs.
-        most: the 95th percentile.
+        percentile_95: of the pairs.
         maximum: of the pairs.
-        flux: relative error of the sum of Y, most of which lies in the mirror direction of a skin.
+        flux: relative error of the sum of Y, of which a skin reflects the larger part in the mirror direction.
     """
 
     mean: float = np.nan
-    most: float = np.nan
+    percentile_95: float = np.nan
     maximum: float = np.nan
     flux: float = np.nan
 
@@ -146,12 +146,14 @@ class ColourError:
 
     @property
     def is_small(self) -> bool:
-        """Whether nobody sees it."""
-        return self.mean <= MAX_MEAN_ERROR and self.most <= MAX_95_ERROR and abs(self.flux) <= MAX_FLUX_ERROR
+        """Whether it is hardly visible."""
+        of_colour = self.mean <= MAX_MEAN_ERROR and self.percentile_95 <= MAX_95_ERROR
+        return of_colour and abs(self.flux) <= MAX_FLUX_ERROR
 
     def __str__(self) -> str:
         return (
-            f"ΔE00 {self.mean:.2g} (mean), {self.most:.2g} (95 %), {self.maximum:.2g} (maximum), flux {self.flux:+.1%}"
+            f"ΔE00 {self.mean:.2g} (mean), {self.percentile_95:.2g} (95 %), {self.maximum:.2g} (maximum), "
+            f"flux {self.flux:+.1%}"
         )
 
 
@@ -235,7 +237,7 @@ class OrderColours:
 
 
 def colours_of(viewed: Viewed) -> ColourTable | OrderColours:
-    """Return the colours of a surface: the smallest table whose error nobody sees, or the most exact one.
+    """Return the colours of a surface: the smallest table whose error is hardly visible, or the most exact one.
 
     Raises:
         ValueError: if more than `MAX_ORDERS` separate orders propagate.

@@ -32,7 +32,7 @@ def nonnegative_colours(edges: Real, colours: Real) -> Real:
     """Return non-negative colours of bins in each of `WORKING_SPACES`, (spaces, n, 3), of which the mean is white.
 
     Light of one wavelength lies outside of a working space, and what a display shows is a mixture of neighbouring ones.
-    These colours have the least squared error of the XYZ of such mixtures.
+    These colours minimise the squared error of the XYZ of such mixtures.
 
     Args:
         edges: of the bins, µm, (n + 1,).

@@ -42,7 +42,7 @@ def test_a_file_holds_the_colours(kind, tmp_path, monkeypatch):
     write_colours(Viewed(spectrum, MediumBelow.of(None, 1.5), 1.55), tmp_path / "a.bin", "radial", "#a0522d")
     header, arrays = read(tmp_path / "a.bin")
     assert (header["version"], header["kind"], header["source"]) == (1, kind, spectrum.source)
-    assert header["error"] == {"mean": 0.1, "most": 0.2, "maximum": 3.0, "flux": 0.01}
+    assert header["error"] == {"mean": 0.1, "percentile_95": 0.2, "maximum": 3.0, "flux": 0.01}
     assert (header["orientation"], header["base"], header["coat"]) == ("radial", "#a0522d", 1.55)
     assert header["index"] == pytest.approx(1.5 / 1.55)
     for field in fields(colours):

@@ -9,7 +9,7 @@ export class DiffractionData {
   readonly source: string;
   readonly material: string;
   /** ΔE00 beside the integral over the wavelength, and the relative error of the flux. */
-  readonly error: { mean: number; most: number; maximum: number; flux: number };
+  readonly error: { mean: number; percentile_95: number; maximum: number; flux: number };
   /** Degrees from the tangent along u to the pattern's x axis, or radial or tangential. */
   readonly orientation: number | 'radial' | 'tangential';
   /** Of the medium below, "#rrggbb". */
