@@ -85,6 +85,15 @@ def test_help_shows_what_a_surface_has_as_options(command):
         assert (code, "No such option: --extent" in error) == (2, True)
 
 
+def test_a_scan_whose_edges_meet_is_a_tile(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    x = np.arange(64) / 64
+    for name, row, extent in (("period", np.sin(2 * np.pi * x), "tile"), ("piece", np.sin(4 * x), "sample")):
+        np.save(f"{name}.npy", 0.1 * np.tile(row, (64, 1)))
+        assert RequestedSurface.of(f"{name}.npy,pixel_size=0.05").recipe.settings.extent == extent
+
+
+@pytest.mark.slow
 def test_one_rule_tells_whether_a_scan_is_a_tile(command, computed):
     """By its seam, in every command: one period of a sinusoid, and the same with an end that does not fit."""
     x = np.arange(64) / 64

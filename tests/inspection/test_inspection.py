@@ -649,6 +649,6 @@ def test_figures_show_y_upwards():
 )
 def test_a_report_states_where_green_light_goes(period, said, command, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
-    code, out, _ = command("inspect", f"sinusoidal,period={period},depth=0.05", "-o", "p.png")
+    code, out, _ = command("inspect", f"sinusoidal,period={period},depth=0.05,samples=32", "-o", "p.png")
     assert code == 0
     assert re.search(rf"^550 nm goes to +{re.escape(said)} *$", out, re.MULTILINE)

@@ -205,6 +205,7 @@ def test_light_of_lamps_is_the_sum_over_their_points(name, llvm):
     assert_sum_over_lamps(scene(SURFACES[name](), **two_lamps(-1 if name == "sheet" else 1)))
 
 
+@pytest.mark.slow
 def test_later_vertices_have_the_limit_of_path(llvm):
     """A lamp below the plate, seen by a second one above: light samples count as much as candidates."""
     bsdf = surface(coherence_length=1.0)

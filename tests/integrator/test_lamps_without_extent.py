@@ -263,6 +263,7 @@ def test_pictures_have_the_means_of_path(film, sensor, llvm):
     np.testing.assert_array_less(np.abs(means[1] - means[0]), 6 * np.hypot(*errors) + 1e-6)
 
 
+@pytest.mark.slow
 def test_sums_of_pixels_contain_the_light_of_lamps(llvm):
     """As `render` takes them, under a filter wider than a pixel."""
     built = scene(blend(), with_sky(), fov=8.0, **FILMS["bands"], rfilter={"type": "gaussian"})
