@@ -11,6 +11,7 @@ import mitsuba as mi
 import numpy as np
 
 from ..errors import RequestError, is_number
+from ..files.picture_file import check_picture
 from .base import nested_plugin
 
 
@@ -91,9 +92,10 @@ def numbers_from(name: str, file: str, white: float = 1.0, others: str = "") -> 
 
     Raises:
         FileNotFoundError: if there is no such file.
-        RequestError: if it is not a picture.
+        RequestError: if it is not a picture, or larger than `check_picture` allows.
     """
     path = str(mi.file_resolver().resolve(file))
+    check_picture(path)
     try:
         bitmap = mi.Bitmap(path)
     except RuntimeError:

@@ -3,15 +3,18 @@
 from __future__ import annotations
 
 import math
+import os
 import warnings
+from contextlib import suppress
 from pathlib import Path
 
 import numpy as np
+import OpenEXR
 from numpy.typing import NDArray
 from PIL import Image, ImageOps
 
 from ..errors import RequestError
-from .reading import BAD_PICTURE, check_file
+from .reading import BAD_PICTURE, check_array, check_file
 
 PICTURE_FORMATS = ("PNG", "JPEG", "TIFF", "WEBP", "GIF", "BMP", "PPM")
 """What a picture may be, by Pillow's names; it would run another program for some others, such as EPS."""
@@ -62,6 +65,28 @@ def read_picture(path: Path, invert: bool = False) -> NDArray[np.float64]:
         ) from None
     is_grey = linear.ndim == 3 and (linear == linear[..., :1]).all()
     return np.ascontiguousarray(linear[..., 0]) if is_grey else linear
+
+
+def check_picture(path: str) -> None:
+    """Check the pixels that a picture declares, before Mitsuba reads it; other files are left to it.
+
+    Raises:
+        RequestError: if its numbers in float32 are more than `check_array` allows.
+    """
+    if not os.path.isfile(path):
+        return
+    shape: tuple[int, ...] = ()
+    # What cannot be opened is reported by Mitsuba; OpenEXR raises exceptions of many kinds.
+    with warnings.catch_warnings(), suppress(Exception):
+        warnings.simplefilter("ignore")
+        if OpenEXR.isOpenExrFile(path):
+            header = OpenEXR.File(path, header_only=True).header()
+            low, high = header["dataWindow"]
+            shape = *(int(n) for n in high - low + 1), len(header["channels"])
+        else:
+            with Image.open(path, formats=(*PICTURE_FORMATS, "TGA")) as image:
+                shape = *image.size, len(image.getbands())
+    check_array(shape, os.path.getsize(path), 4)
 
 
 def _strips(height: int, rows: int) -> list[tuple[int, int]]:

@@ -47,6 +47,7 @@ BAD_PICTURE = (
 )
 MAX_ELEMENTS = 2**20  # of an XML file
 MAX_NESTING = 32  # of nested elements
+MAX_TIFF_PAGES, MAX_TIFF_TAGS = 256, 2**13
 
 
 def check_file(path: str | os.PathLike[str], max_bytes: float = MAX_FILE_BYTES) -> None:
@@ -131,6 +132,33 @@ def check_unpacked(count: int, stored: int) -> None:
         raise RequestError(
             f"got {bytes_text(stored)} that unpack to {bytes_text(count)}, wanted at most {bytes_text(limit)}"
         )
+
+
+def check_tiff(content: bytes) -> None:
+    """Check the chain of pages of a TIFF, which may lead into its data.
+
+    What is no TIFF, or ends within a page, is left to whatever reads it.
+
+    Raises:
+        RequestError: if it has more than `MAX_TIFF_PAGES` pages or `MAX_TIFF_TAGS` tags in all.
+    """
+    order = {b"II": "<", b"MM": ">"}.get(content[:2])
+    if order is None or len(content) < 16:
+        return
+    is_big = struct.unpack_from(f"{order}H", content, 2)[0] == 43
+    number, offset = (
+        struct.Struct(f"{order}{'Q' if is_big else 'H'}"),
+        struct.Struct(f"{order}{'Q' if is_big else 'I'}"),
+    )
+    (at,), pages, tags = offset.unpack_from(content, 8 if is_big else 4), 0, 0
+    while 0 < at <= len(content) - number.size:
+        (count,) = number.unpack_from(content, at)
+        pages, tags, end = pages + 1, tags + count, at + number.size + count * (20 if is_big else 12)
+        if pages > MAX_TIFF_PAGES or tags > MAX_TIFF_TAGS:
+            raise RequestError(f"got a TIFF of more than {MAX_TIFF_PAGES} pages or {MAX_TIFF_TAGS} tags, wanted fewer")
+        if end > len(content) - offset.size:
+            return
+        (at,) = offset.unpack_from(content, end)
 
 
 class _Bounded(ElementTree.TreeBuilder):

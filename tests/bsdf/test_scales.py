@@ -1,5 +1,8 @@
 """Scales of the relief, numbers and textures, against gratings with scaled heights and lengths."""
 
+import io
+import zlib
+
 import drjit as dr
 import mitsuba as mi
 import numpy as np
@@ -26,9 +29,12 @@ from bsdf_support import (
     use,
     vectors,
 )
+from PIL import Image
 
 import mitsuba_diffraction as md
 from mitsuba_diffraction import testing
+from mitsuba_diffraction.bsdf.varying import numbers_from
+from mitsuba_diffraction.errors import RequestError
 
 WI = direction(30, 20)
 TRANSMITS = {"int_ior": 1.5, "transmission": "interface"}
@@ -401,3 +407,15 @@ def test_undiffracted_light_of_a_finer_grating_is_that_of_the_closed_form(llvm, 
         power = (value[:, 0] / -wo[:, 2]).sum() * step**2
         wanted = 0.96 * scipy.special.jv(0, np.pi * 0.5 * 0.03 / (wavelength * 1e-3)) ** 2
         assert power == pytest.approx(wanted * (0.96 if transmission == "sheet" else 1), rel=0.01)
+
+
+def test_a_picture_that_would_fill_the_memory_is_refused(llvm, tmp_path):
+    # A PNG of one row says that it has 13,000.
+    path, written = tmp_path / "large.png", io.BytesIO()
+    Image.new("L", (13_000, 1)).save(written, "PNG")
+    content = bytearray(written.getvalue())
+    content[20:24] = (13_000).to_bytes(4, "big")
+    content[29:33] = zlib.crc32(content[12:29]).to_bytes(4, "big")
+    path.write_bytes(content)
+    with pytest.raises(RequestError, match=r"got 13000 × 13000 × 1 numbers in 0.1 kB, wanted at most"):
+        numbers_from("height_scale", str(path))

@@ -457,6 +457,17 @@ def _with(powers=lambda values: values, **changed):
     return _of_file(".exr", write_changed)
 
 
+def _with_pages(count, tags):
+    """A file of JPK whose first page is followed by so many pages, each of which has so many tags."""
+    content = foreign_scans.jpk()
+    (first,) = struct.unpack_from("<I", content, 4)
+    next_page = first + 2 + 12 * struct.unpack_from("<H", content, first)[0]
+    page = struct.pack("<H", tags) + tags * struct.pack("<HHII", 254, 1, 1, 8)
+    offsets = [len(content) + k * (len(page) + 4) for k in range(count)]
+    pages = b"".join(page + struct.pack("<I", offset) for offset in [*offsets[1:], 0])
+    return content[:next_page] + struct.pack("<I", offsets[0]) + content[next_page + 4 :] + pages
+
+
 def _aliases():
     lists = "".join(f"a{i}: &a{i} [{', '.join(8 * [f'*a{i - 1}' if i else '1'])}]\n" for i in range(8))
     return f"{lists}DATA:\n  - type: formula 1\n    wavelength_range: 0.3 2\n    coefficients: *a7\n".encode()
@@ -487,6 +498,7 @@ CRAFTED = {
 }
 # The same, of files that take seconds to make.
 SLOWLY_CRAFTED = {
+    "many_pages": (".jpk", lambda: _with_pages(200, 4000), _INSTRUMENT),
     "npz_of_zeros": (".npz", _npz_of_zeros, _MICROMETRES),
     "black_scan": (".png", _black, _GREY),
     "black_picture": (".png", _black, read_picture),

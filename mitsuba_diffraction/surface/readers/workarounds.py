@@ -33,7 +33,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ...errors import RequestError
-from ...files.reading import BAD_ARCHIVE, check_unpacked, parse_xml, read_bytes, unpacked_members
+from ...files.reading import BAD_ARCHIVE, check_tiff, check_unpacked, parse_xml, read_bytes, unpacked_members
 from . import nanoscope, scan
 
 _TMD_COMMENT = 24  # bytes, of the only comment that the library reads
@@ -44,6 +44,7 @@ _SUR_UNITS, _SUR_UNIT = 180, 16
 _NMS_HEADER = 3468
 _IBW_HEADER = 384
 _IBW_LABELS, _IBW_DIMENSIONS, _IBW_UNIT = 36, 132, 212  # offsets of four int32, of four int32, of a text
+_TIFF = "jpk", "ps", "lext"
 _JPK_GRID = ("ScanWidth", "ScanLength")  # pixels, by the library's names
 _JPK_IMAGES = ("data-image.jpk-qi-image", "data-image.force")
 
@@ -69,7 +70,11 @@ def rewritten(path: Path, name: str) -> Rewritten:
         RequestError: if the file is not of this format.
     """
     if name == "jpk" and zipfile.is_zipfile(path):
-        return Rewritten(io.BytesIO(_jpk_image(path)))
+        image = _jpk_image(path)
+        check_tiff(image)
+        return Rewritten(io.BytesIO(image))
+    if name in _TIFF:
+        check_tiff(read_bytes(path))
     if name not in (*_REWRITE, "di"):
         return Rewritten(_archive(path) if zipfile.is_zipfile(path) else str(path))
     data = read_bytes(path)
