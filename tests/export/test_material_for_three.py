@@ -13,7 +13,15 @@ from test_colour_table import directions, face, viewed
 
 from mitsuba_diffraction.export import colour_file
 from mitsuba_diffraction.export.colour_file import write_colours
-from mitsuba_diffraction.optics.color import SRGB_TO_XYZ, XYZ_to_linear_sRGB, auto_exposure, delta_E, into_gamut
+from mitsuba_diffraction.optics.color import (
+    SRGB_TO_XYZ,
+    XYZ_to_linear_sRGB,
+    auto_exposure,
+    daylight,
+    delta_E,
+    into_gamut,
+    matching_functions,
+)
 
 sync_api = pytest.importorskip("playwright.sync_api", reason="the package playwright is not installed")
 
@@ -70,6 +78,7 @@ def tab(folder):
 
 def call(tab, function, *arguments):
     """Call a function of the page; texels as (n, 4)."""
+    tab.messages.clear()
     text = tab.evaluate(f"async (text) => JSON.stringify(await {function}(...JSON.parse(text)))", json.dumps(arguments))
     return np.array(json.loads(text)).reshape(-1, 4)
 
@@ -123,7 +132,7 @@ def test_pairs_of_directions_have_the_colours_of_the_table(name, exported, tab):
     assert error.mean() < 0.5
     assert np.percentile(error, 95) < 1.5
     assert found.sum() == pytest.approx(wanted.sum(), rel=0.03)
-    assert not tab.messages
+    assert not tab.messages, "\n".join(tab.messages)[:3000]
 
 
 SIZE, EYE = 24, np.array([0.4, -1.8, 3.0])
@@ -197,7 +206,7 @@ def test_a_lit_plane_has_the_colours_of_its_directions(name, options, exported, 
     position = np.array([-0.5, 2.1, 3.0])
     shown = {"eye": EYE.tolist(), "position": position.tolist(), "size": SIZE, "material": {}, **options}
     found = call(tab, "plane", f"{name.replace(' ', '_')}.bin", shown)[:, :3]
-    assert not tab.messages
+    assert not tab.messages, "\n".join(tab.messages)[:3000]
     points, orientation = seen(), shown["material"].get("orientation", 0)
     radial = shown["material"].get("radial", orientation == "tangential")
     frame = axes(points, 90 if orientation == "tangential" else orientation, radial)
@@ -226,4 +235,54 @@ def test_a_file_that_cannot_be_read_is_grey_and_says_so_once(exported, folder, t
         grey = call(tab, "plane", f"{name}.bin", shown)[27, :3]
         assert np.ptp(grey) < 1e-3 < grey.min()
         assert tab.messages == [f"DiffractionMaterial: {name}.bin: {problem}; shown in grey"]
-        tab.messages.clear()
+
+
+def under_white_sky(surface, wo):
+    """XYZ of the light of a sky of radiance one, (n, 3), by all nodes of a spectrum and all wavelengths; wo (n, 3)."""
+    q = np.stack(np.meshgrid(*surface.spectrum.grid.frequencies()), -1).reshape(-1, 2)
+    step, n = 6.0, surface.coat
+    nm, everything = np.arange(380 + step / 2, 740, step), np.arange(360.0, 831.0)
+    light = matching_functions(nm) * daylight(nm)[:, None] * step
+    light /= matching_functions(everything)[:, 1] @ daylight(everything)
+    total, nodes = np.zeros((len(wo), 3)), np.linspace(0, 2 * n, 9)
+    for wavelength, colour in zip(nm * 1e-3, light, strict=True):
+        powers = np.stack([surface.powers(2 * np.pi * w / wavelength).ravel() for w in nodes])
+        for found, direction in zip(total, wo, strict=True):
+            tangent = -(direction[:2] + wavelength * q)
+            kept = (tangent**2).sum(axis=1) < 1 - 1e-6
+            tangent, u = tangent[kept], wavelength * q[kept]
+            ki, ko = np.sqrt(n**2 - (tangent**2).sum(axis=1)), np.sqrt(n**2 - 1 + direction[2] ** 2)
+            w = ki + ko
+            square = (u**2).sum(axis=1) + w**2
+            a, b = square / (2 * ki), square / (2 * ko)
+            k_g = np.minimum(a * b / w**2, 2 * np.minimum(a, b) / w)
+            at = w / nodes[1]
+            below = np.minimum(at.astype(int), len(nodes) - 2)
+            two = powers[below, np.flatnonzero(kept)], powers[below + 1, np.flatnonzero(kept)]
+            power = two[0] * (1 - at + below) + two[1] * (at - below)
+            found += (power * k_g * surface.reflectance(wavelength, u, w)).sum() * colour
+    return total
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", ["blaze", "skin"])
+def test_a_white_sky_has_the_light_of_all_orders(name, exported, tab):
+    surface, _ = exported(name)
+    shown = {"eye": EYE.tolist(), "sky": True, "size": SIZE, "material": {"skyPoints": 256}}
+    found = call(tab, "plane", f"{name}.bin", shown)[:, :3]
+    assert not tab.messages, "\n".join(tab.messages)[:3000]
+    points = seen()
+    some = [k for k in range(len(points)) if (np.abs(points[k, :2]) < 0.9).all()][::60]
+    wanted = mixed(under_white_sky(surface, unit(EYE - points)[some]))
+    error = difference(found[some] @ SRGB_TO_XYZ.T, wanted)
+    assert error.mean() < 2
+    assert (found[some] @ SRGB_TO_XYZ.T).sum() == pytest.approx(wanted.sum(), rel=0.05)
+
+
+@pytest.mark.slow
+def test_a_screen_casts_a_shadow(exported, tab):
+    exported("skin")
+    shown = {"eye": EYE.tolist(), "position": [0.1, 0.2, 3], "size": SIZE, "material": {}, "light": "spot"}
+    light, shadow = (call(tab, "plane", "skin.bin", {**shown, "shadow": s})[:, :3] for s in (False, True))
+    assert not tab.messages, "\n".join(tab.messages)[:3000]
+    assert shadow.sum() < 0.02 * light.sum()

@@ -7,7 +7,7 @@ import {
 } from 'three';
 import { LightingModel, LightingNode, MeshStandardNodeMaterial } from 'three/webgpu';
 import {
-  If, Loop, cameraViewMatrix, diffuseColor, float, ivec2, lightViewPosition, normalView, pmremTexture, positionView,
+  If, Loop, cameraWorldMatrix, diffuseColor, float, ivec2, lightViewPosition, normalView, pmremTexture, positionView,
   positionViewDirection, select, texture, texture3D, textureLoad, uniform, uv, vec2, vec3,
 } from 'three/tsl';
 
@@ -52,19 +52,19 @@ export class DiffractionData {
     Object.assign(this.table, { format: RGBFormat, type: UnsignedInt5999Type, magFilter: LinearFilter });
     Object.assign(this.table, { minFilter: LinearFilter, unpackAlignment: 4, needsUpdate: true });
     Object.assign(this, { size, layers });
-    // Under a sky: points of u, drawn by Y on the middle layer in equal steps of their sum.
+    // Under a sky: points of u, drawn by X + Y + Z on the middle layer in equal steps of their sum.
     const middle = values.subarray(size * size * (layers >> 1), size * size * ((layers >> 1) + 1));
-    const a = this.stretch, edge = Math.asinh(MAX_U / a), node = (k) => a * Math.sinh(edge * (2 * (k + 0.5) / size - 1));
-    const width = (k) => a * Math.cosh(edge * (2 * (k + 0.5) / size - 1)) * edge * 2 / size;
+    const a = this.stretch, edge = Math.asinh(MAX_U / a), x = (k) => edge * (2 * k / (size - 1) - 1);
+    const node = (k) => a * Math.sinh(x(k)), width = (k) => a * Math.cosh(x(k)) * edge * 2 / (size - 1);
     const sums = new Float64Array(size * size + 1);
     for (let k = 0; k < size * size; k++) {
       const i = k % size, j = (k - i) / size, p = middle[k], outside = node(i) ** 2 + node(j) ** 2 > 4;
-      sums[k + 1] = sums[k] + (outside ? 0 : (p >>> 9 & 511) * 2 ** ((p >>> 27) - 24) * width(i) * width(j));
+      const XYZ = ((p & 511) + (p >>> 9 & 511) + (p >>> 18 & 511)) * 2 ** ((p >>> 27) - 24);
+      sums[k + 1] = sums[k] + (outside ? 0 : XYZ * width(i) * width(j));
     }
     const drawn = new Float32Array(4 * 256);
     for (let n = 0, k = 0; n < 256; n++) {
       const order = (n * 101) % 256; // so that the first points, too, are spread out
-      if (n === 0) k = 0;
       while (k < size * size - 1 && sums[k + 1] < (n + 0.5) / 256 * sums[size * size]) k++;
       const i = k % size, j = (k - i) / size;
       drawn.set([node(i), node(j), (sums[k + 1] - sums[k]) / sums[size * size] / (width(i) * width(j))], 4 * order);
@@ -327,9 +327,7 @@ class DiffractionLighting extends LightingModel {
 
   sky(environment, builder) {
     const { reflectedLight } = builder.context, { brdf, wo } = this;
-    const from = (direction, roughness) => environment.context({
-      getUV: () => direction.transformDirection(cameraViewMatrix.transpose()), getTextureLevel: () => roughness,
-    }).rgb;
+    const from = (direction, roughness) => pmremTexture(environment, direction.transformDirection(cameraWorldMatrix), roughness);
     // α of the lobe of a rough mirror that fills about this solid angle; roughness is its root.
     const radiance = (wi, area) => from(this.global(wi), area.div(4 * Math.PI).sqrt().sqrt().clamp(0, 1));
     reflectedLight.indirectSpecular.addAssign(brdf.underSky(wo, radiance, this.material.skyPoints));
@@ -368,7 +366,7 @@ export class DiffractionMaterial extends MeshStandardNodeMaterial {
 
   setupEnvironment(builder) {
     if (this.diffraction === null) return super.setupEnvironment(builder);
-    const environment = this.envMap ? pmremTexture(this.envMap) : builder.environmentNode;
-    return environment ? new SkyNode(environment) : null;
+    const environment = this.envMap ?? builder.environmentNode?.value;
+    return environment?.isTexture ? new SkyNode(environment) : null;
   }
 }
