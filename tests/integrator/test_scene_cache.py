@@ -11,6 +11,7 @@ import pytest
 from bsdf_support import uniform
 
 from mitsuba_diffraction.bsdf.base import living
+from mitsuba_diffraction.integrator.scene_cache import SceneCache
 from mitsuba_diffraction.integrator.unshadowed_light import UnshadowedLight
 
 pytestmark = pytest.mark.usefixtures("llvm")
@@ -72,7 +73,7 @@ UPDATES = {
 }
 
 
-def update(scene: mi.Scene, changes: dict) -> None:
+def update(scene: mi.Object, changes: dict) -> None:
     parameters = mi.traverse(scene)
     for name, value in changes.items():
         parameters[name] = value
@@ -135,6 +136,27 @@ def test_what_a_scene_needs_is_made_once(monkeypatch):
         guide_and_slots(scene)
         mi.render(scene, spp=1, seed=frame)
     assert len(made) == 1
+
+
+def test_a_change_of_any_number_of_the_scene_or_of_a_sensor_beside_it_is_noticed():
+    scene, cache, made = loaded(), SceneCache(), []
+    apart = mi.load_dict({"type": "perspective", "fov": 40, "to_world": seen_from(1.0)})
+
+    def count() -> int:
+        cache.follow(scene, apart)
+        cache.once("number", lambda: made.append(0))
+        return len(made)
+
+    changed = 0
+    for of in (scene, apart):
+        for name, value in mi.traverse(of).items():
+            if isinstance(value, mi.Float) and dr.width(value) == 1:
+                before = count()
+                assert count() == before
+                update(of, {name: 0.9 * value})
+                assert count() == before + 1, name
+                changed += of is apart
+    assert changed
 
 
 def test_a_scene_is_freed_by_its_last_reference():
