@@ -42,7 +42,7 @@ DISCS = ("compact_disc", "dvd")
 
 @dataclass(frozen=True)
 class InScene:
-    """What a scene says of a grating that a page shows.
+    """The parameters of a grating in a scene that a page shows.
 
     Attributes:
         media: around it, in air.
@@ -159,7 +159,7 @@ class Surface:
         surface: RequestedSurface,
         progress: Callable[[str], AbstractContextManager[Progress]] = no_progress,
     ) -> Surface:
-        """Return a requested surface; what a scene says of its material stands aside (`OF_SCENE`).
+        """Return a requested surface, whose parameters in a scene (`OF_SCENE`) are set aside.
 
         Args:
             surface: a recipe, a saved spectrum, a profile or a scan.
@@ -196,7 +196,7 @@ class Surface:
 SHORTEST = VISIBLE[0]  # nm, of the wavelengths of a page
 _SHOWN = ("coat_ior", "height_scale", "int_ior", "material", "orientation")
 OF_SCENE = ("theory", *_SHOWN, *_NOT_SHOWN)
-"""Names of what a scene says of a grating, beside the values of its recipe."""
+"""Names of the parameters of a grating in a scene, beside the values of its recipe."""
 
 
 def with_plastic(recipe: Recipe, parameters: Mapping[str, Any], covered: bool) -> dict[str, Any]:
