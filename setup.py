@@ -16,6 +16,8 @@ class BuildWithExamples(build_py):
             return
         examples = Path(self.build_lib) / "mitsuba_diffraction" / "examples"
         shutil.rmtree(examples, ignore_errors=True)
+        examples.mkdir()
+        shutil.copy("LICENSE", examples)  # for the extension of Blender
         for folder in ("scenes", "precompute"):
             # What the scenes' scripts and earlier renderings left, what judges figures of the manual, and two reliefs
             # of the gallery, which are too large; textures of the scenes lie in folders of their own.

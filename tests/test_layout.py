@@ -19,6 +19,7 @@ PACKAGE = Path(mitsuba_diffraction.__file__).parent
 MODULES = {
     ".".join(["mitsuba_diffraction", *path.relative_to(PACKAGE).with_suffix("").parts]).removesuffix(".__init__"): path
     for path in PACKAGE.rglob("*.py")
+    if "assets" not in path.parts  # code for other programs
 }
 
 

@@ -10,6 +10,7 @@ from typing import Annotated
 import typer
 
 from ..errors import RequestError
+from ..export.blender_extension import write_extension
 from ..export.colour_file import check_base, write_colours
 from ..export.colour_table import Viewed
 from ..export.cycles import write_shader
@@ -50,20 +51,21 @@ _RANGES = {
 
 def export(
     surface: Annotated[
-        str,
+        str | None,
         typer.Argument(
             metavar=SURFACE,
             help="a recipe (.toml), a profile, a scan, or for .bin, .osl and .npz a saved spectrum (.exr); "
-            f"{KEYS_OF_RECIPES}, theory, material, int_ior",
+            f"{KEYS_OF_RECIPES}, theory, material, int_ior; for .zip none",
         ),
-    ],
+    ] = None,
+    *,
     output: Annotated[
         Path,
         typer.Option(
             "-o",
             "--output",
-            help=".osl: a shader for Blender's Cycles; .npz: its tables, for Blender's own nodes; .bin: colours for "
-            "three.js; .csv: the orders as a table; .json: a grating for Zemax OpticStudio and Speos",
+            help=".osl: a shader for Blender's Cycles; .zip: an extension of Blender; .npz: a surface for it; .bin: "
+            "colours for three.js; .csv: the orders as a table; .json: a grating for Zemax OpticStudio and Speos",
         ),
     ],
     wavelength: Annotated[
@@ -82,6 +84,9 @@ def export(
     overwrite: Overwrite = False,
 ) -> None:
     """Write a surface for another program."""
+    if surface is None:
+        _write_extension(output, overwrite)
+        return
     requested = RequestedSurface.of(surface, aside=(*_OF_MATERIAL, *_IN_SCENES))
     check_suffix("-o", output, _COLOURS, *_SHADERS, *_RANGES)
     ranges = {"wavelength": wavelength, "angle": angle, "azimuth": azimuth}
@@ -96,6 +101,15 @@ def export(
         raise RequestError(f"{surface}: got a saved spectrum for {output}, wanted the recipe, the profile or the scan")
     else:
         _write_orders(requested, output, given)
+
+
+def _write_extension(output: Path, overwrite: bool) -> None:
+    if output.suffix.lower() != ".zip":
+        raise RequestError(f"SURFACE: got none for {output}, wanted a surface, or -o with a file .zip")
+    check_outputs([], [("-o", output)], overwrite=overwrite)
+    with progress_bar("tables of surfaces") as progress:
+        held = write_extension(output, progress)
+    tell(f"{output}: {held}")
 
 
 def _refuse_parameters_of_scenes(requested: RequestedSurface, output: Path) -> None:

@@ -27,7 +27,6 @@ def write_node_tables(tables: ShaderTables, path: str | os.PathLike[str]) -> Non
         "matrices": np.stack(list(WORKING_SPACES.values())),
         "signed_colours": tables.colours,
         "colours": nonnegative_colours(tables.edges, tables.colours),
-        "entering": tables.entering,
         "max_height_scale": tables.max_height_scale,
     }
     single = {k: v.astype(np.float32) if getattr(v, "dtype", None) == np.float64 else v for k, v in arrays.items()}

@@ -95,7 +95,7 @@ class ShaderTables:
             ValueError: if the material is wrong.
         """
         what = " ".join(description(spectrum.source, Media(below), 0.0).split())
-        edges, colours = _wavelength_bins()
+        edges, colours = bins_of_wavelengths()
         index = np.array([below.at(w) for w in (edges[1:] + edges[:-1]) / 2], np.complex128)
         index = np.where(np.isinf(index), 0, index)
         max_kappa = min(_MAX_HEIGHT_SCALE * 4e3 * np.pi / SHORTEST_DRAWN, spectrum.max_kappa)
@@ -134,7 +134,7 @@ class ShaderTables:
         return 1 - float(np.mean(2 * cosines * np.mean(fresnel(cosines, index), axis=0)))
 
 
-def _wavelength_bins() -> tuple[Real, Real]:
+def bins_of_wavelengths() -> tuple[Real, Real]:
     """Return the edges of bins of equal probability, µm, (n + 1,), and the linear sRGB of their light, (n, 3).
 
     The probability is that of what a display needs, the mean of |r|, |g| and |b|; half of it is the luminance. The mean

@@ -25,6 +25,7 @@ WORKING_SPACES = MappingProxyType(
 """Matrices from linear sRGB, by Blender's names."""
 _SPREADS = (0.03, 0.1, 0.2)  # standard deviations of the light of an order in a direction, of its mean wavelength
 _MEANS = 60  # of the wavelengths of such mixtures
+_WEIGHT_OF_MIXTURES = 4.0  # relative to that of a bin
 _WEIGHT_OF_WHITE = 1e3
 
 
@@ -32,7 +33,8 @@ def nonnegative_colours(edges: Real, colours: Real) -> Real:
     """Return non-negative colours of bins in each of `WORKING_SPACES`, (spaces, n, 3), of which the mean is white.
 
     Light of one wavelength lies outside of a working space, and what a display shows is a mixture of neighbouring ones.
-    These colours minimise the squared error of the XYZ of such mixtures.
+    These colours minimise the squared error of the XYZ of such mixtures, and of the bins themselves, without which a
+    few bins would have all of the light and a picture would be noisy.
 
     Args:
         edges: of the bins, µm, (n + 1,).
@@ -45,6 +47,8 @@ def nonnegative_colours(edges: Real, colours: Real) -> Real:
         x.ravel() for x in np.meshgrid(np.linspace(middle[0], middle[-1], _MEANS), np.array(_SPREADS), indexing="ij")
     )
     mixtures = np.exp(-0.5 * ((middle - means[:, None]) / (spreads * means)[:, None]) ** 2)
+    mixtures *= _WEIGHT_OF_MIXTURES / mixtures.sum(axis=1, keepdims=True)
+    mixtures = np.vstack([np.eye(len(middle)), mixtures])
     found = []
     for matrix in WORKING_SPACES.values():
         to_XYZ = SRGB_TO_XYZ @ np.linalg.inv(matrix)

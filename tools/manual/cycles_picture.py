@@ -1,12 +1,12 @@
-"""Renders a shader of `mitsuba-diffraction export` in Cycles, by Blender's Python package, and saves linear sRGB.
+"""Renders what `mitsuba-diffraction export` writes for Cycles, by Blender's Python package, and saves linear sRGB.
 
 Run it by a Python that has bpy (`pip install bpy==4.5.15`, Python 3.11), and NumPy, which comes with it:
 
-    python tools/manual/cycles_picture.py SHADER.osl plane|sphere|disc RADIUS|sky SAMPLES SIZE OUT.npy [WORKING_SPACE]
+    python tools/manual/cycles_picture.py FILE plane|sphere|disc RADIUS|sky SAMPLES SIZE OUT.npy [WORKING_SPACE]
 
-In another working space of Blender 5.0 or later, such as "Linear Rec.2020", OUT is RGB of that.
-The wheel has no `oslquery`, by which Blender's window finds the sockets of a shader; they are added by hand here. The
-scene is that of `scene` in tests/export/test_cycles.py.
+FILE is a shader (.osl), or the tables of the node group (.npz). In another working space of Blender 5.0 or later, such
+as "Linear Rec.2020", OUT is RGB of that. The wheel has no `oslquery`, by which Blender's window finds the sockets of a
+shader; they are added by hand here. The scene is that of `scene` in tests/export/test_cycles.py.
 """
 
 import contextlib
@@ -17,6 +17,9 @@ import time
 
 import bpy
 import numpy as np
+
+REPOSITORY = os.path.dirname(os.path.dirname(os.path.dirname(os.path.abspath(__file__))))
+sys.path.append(os.path.join(REPOSITORY, "mitsuba_diffraction", "export", "assets", "blender"))  # nodes
 
 INPUTS = (
     ("HeightScale", "NodeSocketFloat", 1.0),
@@ -30,7 +33,11 @@ INPUTS = (
 
 
 def material_of(shader):
-    """A material with the Script node of a shader, and the node."""
+    """A material with the Script node of a shader, or the group of nodes of tables, and the node."""
+    if shader.endswith(".npz"):
+        import nodes as of_blender
+
+        return of_blender.new_material("grating", of_blender.read_tables(shader))
     import _cycles
 
     compiled = f"{os.path.splitext(shader)[0]}.oso"
@@ -70,7 +77,8 @@ def build(shader, shape, light, samples, size, space=None):
     scene = bpy.context.scene
     scene.render.engine = "CYCLES"
     cycles = scene.cycles
-    cycles.device, cycles.shading_system, cycles.samples, cycles.max_bounces = "CPU", True, samples, 1
+    cycles.device, cycles.samples, cycles.max_bounces = "CPU", samples, 1
+    cycles.shading_system = shader.endswith(".osl")
     cycles.use_adaptive_sampling, cycles.use_denoising, cycles.sample_clamp_indirect = False, False, 0
     cycles.pixel_filter_type = "BOX"
     scene.render.resolution_x = scene.render.resolution_y = size
@@ -85,7 +93,7 @@ def build(shader, shape, light, samples, size, space=None):
         material.node_tree.links.new(tangent.outputs[0], script.inputs["Tangent"])
     else:
         bpy.ops.mesh.primitive_plane_add(size=2)
-        script.inputs["Radial"].default_value = int(shape == "disc")
+        script.inputs["Radial"].default_value = type(script.inputs["Radial"].default_value)(shape == "disc")
     bpy.context.object.data.materials.append(material)
     world = scene.world = bpy.data.worlds.new("world")
     world.use_nodes = True

@@ -1,0 +1,154 @@
+"""Blender's extension "Diffraction Gratings": materials of discs, foil, skins and line gratings."""
+
+from __future__ import annotations
+
+import os
+from typing import Any
+
+import bpy
+import numpy as np
+
+from . import line_gratings, nodes
+
+_TABLES = os.path.join(os.path.dirname(__file__), "tables")
+_READY = {
+    "compact_disc": "Compact disc",
+    "dvd": "DVD",
+    "foil": "Embossed foil",
+    "xenopeltis": "Skin of Xenopeltis",
+    "elaphe": "Skin of Elaphe",
+}
+_FILE = "file"
+_MEDIA = {"own": "Its own", "Al": "Aluminium", "Ag": "Silver", "Au": "Gold", "Cu": "Copper", "index": "Glass, skin"}
+
+
+def _items(names: dict[str, str]) -> tuple[tuple[str, str, str], ...]:
+    return tuple((key, name, "") for key, name in names.items())
+
+
+class DiffractionSettings(bpy.types.PropertyGroup):
+    """What the panel asks for."""
+
+    surface: bpy.props.EnumProperty(  # type: ignore[valid-type]
+        name="Surface", items=_items({**_READY, **line_gratings.PROFILES, _FILE: "From a file…"})
+    )
+    file: bpy.props.StringProperty(  # type: ignore[valid-type]
+        name="File", subtype="FILE_PATH", description="Tables that mitsuba-diffraction export -o NAME.npz wrote"
+    )
+    medium: bpy.props.EnumProperty(name="Material", items=_items(_MEDIA))  # type: ignore[valid-type]
+    index: bpy.props.FloatProperty(  # type: ignore[valid-type]
+        name="Refractive Index", default=1.5, min=1.01, max=4.0, precision=3
+    )
+    period: bpy.props.FloatProperty(  # type: ignore[valid-type]
+        name="Period (µm)", default=1.667, min=0.4, max=50.0, precision=3
+    )
+    depth: bpy.props.FloatProperty(  # type: ignore[valid-type]
+        name="Depth (µm)", default=0.15, min=0.0, max=2.0, precision=3
+    )
+    duty: bpy.props.FloatProperty(  # type: ignore[valid-type]
+        name="Duty", default=0.5, min=0.01, max=0.99, description="Width of the ridges relative to the period"
+    )
+
+    def tables(self) -> dict[str, np.ndarray]:
+        """Return the tables of the surface.
+
+        Raises:
+            ValueError, OSError: if the file does not have them.
+        """
+        if self.surface == _FILE:
+            tables = nodes.read_tables(bpy.path.abspath(self.file))
+        elif self.surface in line_gratings.PROFILES:
+            base = nodes.read_tables(os.path.join(_TABLES, "foil.npz"))
+            tables = line_gratings.line_grating(self.surface, self.period, self.depth, self.duty, base)
+        else:
+            tables = nodes.read_tables(os.path.join(_TABLES, f"{self.surface}.npz"))
+        if self.medium == "index":
+            tables["index"] = np.full(len(tables["index"]), self.index, np.complex128)
+        elif self.medium != "own":
+            tables["index"] = np.load(os.path.join(_TABLES, "metals.npz"))[self.medium]
+        return tables
+
+
+class MATERIAL_OT_diffraction_create(bpy.types.Operator):
+    """Give the active object a new material that diffracts light"""
+
+    bl_idname = "material.diffraction_create"
+    bl_label = "Create Material"
+    bl_options = {"REGISTER", "UNDO"}  # noqa: RUF012  (Blender's)
+
+    @classmethod
+    def poll(cls, context: bpy.types.Context) -> bool:
+        return context.object is not None and hasattr(context.object.data, "materials")
+
+    def execute(self, context: bpy.types.Context) -> set[str]:
+        settings = context.scene.diffraction
+        name = settings.bl_rna.properties["surface"].enum_items[settings.surface].name
+        if settings.surface == _FILE:
+            name = os.path.splitext(os.path.basename(settings.file))[0]
+        try:
+            material, group = nodes.new_material(name, settings.tables())
+        except (OSError, ValueError) as error:
+            what = error.strerror if isinstance(error, OSError) and error.strerror else error
+            self.report({"ERROR"}, f"{settings.file or name}: {what}")
+            return {"CANCELLED"}
+        if settings.surface in ("compact_disc", "dvd"):
+            group.inputs["Radial"].default_value = True
+        if getattr(context.object.data, "uv_layers", None):
+            tangent = material.node_tree.nodes.new("ShaderNodeTangent")
+            tangent.direction_type = "UV_MAP"
+            tangent.location = (-220, -120)
+            material.node_tree.links.new(tangent.outputs[0], group.inputs["Tangent"])
+        if context.object.material_slots:
+            context.object.active_material = material
+        else:
+            context.object.data.materials.append(material)
+        return {"FINISHED"}
+
+
+class MATERIAL_PT_diffraction(bpy.types.Panel):
+    """The panel in Material Properties."""
+
+    bl_label = "Diffraction Grating"
+    bl_space_type = "PROPERTIES"
+    bl_region_type = "WINDOW"
+    bl_context = "material"
+
+    @classmethod
+    def poll(cls, context: bpy.types.Context) -> bool:
+        return MATERIAL_OT_diffraction_create.poll(context)
+
+    def draw(self, context: bpy.types.Context) -> None:
+        settings, layout = context.scene.diffraction, self.layout
+        layout.use_property_split = True
+        layout.prop(settings, "surface")
+        if settings.surface == _FILE:
+            layout.prop(settings, "file")
+        elif settings.surface in line_gratings.PROFILES:
+            layout.prop(settings, "period")
+            layout.prop(settings, "depth")
+            if settings.surface == "lamellar":
+                layout.prop(settings, "duty")
+        layout.prop(settings, "medium")
+        if settings.medium == "index":
+            layout.prop(settings, "index")
+        layout.operator(MATERIAL_OT_diffraction_create.bl_idname, icon="MATERIAL")
+        material: Any = context.object.active_material
+        if material and material.node_tree and (group := material.node_tree.nodes.get("Diffraction")):
+            for socket in group.inputs:
+                if not socket.is_linked and not socket.hide_value:
+                    layout.prop(socket, "default_value", text=socket.name)
+
+
+_CLASSES = (DiffractionSettings, MATERIAL_OT_diffraction_create, MATERIAL_PT_diffraction)
+
+
+def register() -> None:
+    for each in _CLASSES:
+        bpy.utils.register_class(each)
+    bpy.types.Scene.diffraction = bpy.props.PointerProperty(type=DiffractionSettings)
+
+
+def unregister() -> None:
+    del bpy.types.Scene.diffraction
+    for each in reversed(_CLASSES):
+        bpy.utils.unregister_class(each)

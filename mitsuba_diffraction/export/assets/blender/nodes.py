@@ -1,0 +1,412 @@
+"""A node group of Blender's own shader nodes that diffracts light, for every device of Cycles.
+
+Each sample draws a wavelength and an order by White Noise of its position, and returns one Glossy lobe about the half
+vector of the direction from which light of that order comes. Needs bpy and NumPy alone; lengths are in µm, frequencies
+in cycles/µm. `tables` are the arrays of `mitsuba-diffraction export SURFACE -o NAME.npz`.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any
+
+import bpy
+import numpy as np
+
+_FORMAT = 1  # of the tables
+_SLOTS = 4096  # of orders, each with as many as is its probability
+_COSINES = 64  # of the reflectance
+_AZIMUTHS, _ALBEDO_COSINES = 25, 16
+
+_INPUTS: tuple[tuple[str, str, Any, tuple[float, float] | None, str], ...] = (
+    ("HeightScale", "NodeSocketFloat", 1.0, (0.0, 2.0), "Factor of the heights"),
+    ("Orientation", "NodeSocketFloat", 0.0, (-360.0, 360.0), "Degrees from the tangent to the x axis of the pattern"),
+    ("Radial", "NodeSocketBool", False, None, "The tangent points away from the object's z axis, as on a disc"),
+    ("Tangent", "NodeSocketVector", (0.0, 0.0, 0.0), None, "Of the pattern; unconnected: the object's x axis"),
+    ("Roughness", "NodeSocketFloat", 1.0, (0.0, 100.0), "Factor of the width of the orders"),
+    ("Tint", "NodeSocketColor", (1.0, 1.0, 1.0, 1.0), None, "Factor of all colours"),
+    ("BaseColor", "NodeSocketColor", (0.0, 0.0, 0.0, 1.0), None, "Diffuse colour below a dielectric"),
+)
+
+
+def read_tables(path: str) -> dict[str, np.ndarray]:
+    """Return the tables of a file.
+
+    Raises:
+        ValueError: if it is another file, or of another version.
+        OSError: if it cannot be read.
+    """
+    try:
+        with np.load(path, allow_pickle=False) as read:
+            tables = dict(read)
+        known = int(tables["format"])
+    except OSError:
+        raise
+    except Exception:
+        raise ValueError("not tables of mitsuba-diffraction export -o NAME.npz") from None
+    if known != _FORMAT:
+        raise ValueError(f"tables of format {known}; this version reads format {_FORMAT}")
+    return tables
+
+
+def working_space() -> str:
+    """Return the working space of the file that is open, in Blender's words."""
+    colorspace = getattr(bpy.data, "colorspace", None)  # since 5.0; one space before
+    return "Linear Rec.709" if colorspace is None else colorspace.working_space
+
+
+def new_material(name: str, tables: Mapping[str, np.ndarray]) -> tuple[bpy.types.Material, bpy.types.ShaderNode]:
+    """Return a material of these tables, and its group."""
+    material = bpy.data.materials.new(name)
+    material.use_nodes = True
+    nodes = material.node_tree.nodes
+    nodes.clear()
+    group = nodes.new("ShaderNodeGroup")
+    group.node_tree = node_group(name, tables)
+    group.name = group.label = "Diffraction"
+    group.width = 220
+    output = nodes.new("ShaderNodeOutputMaterial")
+    output.location = (320, 0)
+    material.node_tree.links.new(group.outputs["BSDF"], output.inputs["Surface"])
+    return material, group
+
+
+def node_group(name: str, tables: Mapping[str, np.ndarray]) -> bpy.types.NodeTree:
+    """Return a new group of these tables."""
+    tree = bpy.data.node_groups.new(name, "ShaderNodeTree")
+    for label, kind, value, limits, tip in _INPUTS:
+        socket = tree.interface.new_socket(label, in_out="INPUT", socket_type=kind)
+        socket.default_value = value
+        socket.description = tip
+        socket.hide_value = label == "Tangent"
+        if limits:
+            socket.min_value, socket.max_value = limits
+        if label == "HeightScale":
+            socket.max_value = float(tables["max_height_scale"])
+    tree.interface.new_socket("BSDF", in_out="OUTPUT", socket_type="NodeSocketShader")
+    _Grating(tree, name, tables).build()
+    return tree
+
+
+class _Nodes:
+    """Adds nodes to a tree; sockets and numbers are operands."""
+
+    def __init__(self, tree: bpy.types.NodeTree) -> None:
+        self.tree = tree
+
+    def node(self, kind: str, **settings: Any) -> Any:
+        node = self.tree.nodes.new(kind)
+        for key, value in settings.items():
+            setattr(node, key, value)
+        number = len(self.tree.nodes)
+        node.location = (number * 40 % 2400, -(number * 40 // 2400) * 300)
+        node.hide = True
+        return node
+
+    def put(self, socket: Any, value: Any) -> None:
+        if isinstance(value, bpy.types.NodeSocket):
+            self.tree.links.new(value, socket)
+        else:
+            socket.default_value = value
+
+    def math(self, operation: str, *operands: Any) -> Any:
+        node = self.node("ShaderNodeMath", operation=operation)
+        for socket, value in zip(node.inputs, operands):  # noqa: B905  (of three sockets, often one is not used)
+            self.put(socket, value)
+        return node.outputs[0]
+
+    def vector(self, operation: str, *operands: Any) -> Any:
+        node = self.node("ShaderNodeVectorMath", operation=operation)
+        for k, value in enumerate(operands):
+            self.put(node.inputs["Scale"] if operation == "SCALE" and k else node.inputs[k], value)
+        return node.outputs["Value" if operation in ("DOT_PRODUCT", "LENGTH") else "Vector"]
+
+    def add(self, a: Any, b: Any) -> Any:
+        return self.math("ADD", a, b)
+
+    def subtract(self, a: Any, b: Any) -> Any:
+        return self.math("SUBTRACT", a, b)
+
+    def multiply(self, first: Any, *others: Any) -> Any:
+        for other in others:
+            first = self.math("MULTIPLY", first, other)
+        return first
+
+    def divide(self, a: Any, b: Any) -> Any:
+        return self.math("DIVIDE", a, b)
+
+    def larger(self, a: Any, b: Any) -> Any:
+        return self.math("MAXIMUM", a, b)
+
+    def smaller(self, a: Any, b: Any) -> Any:
+        return self.math("MINIMUM", a, b)
+
+    def dot(self, a: Any, b: Any) -> Any:
+        return self.vector("DOT_PRODUCT", a, b)
+
+    def scaled(self, a: Any, factor: Any) -> Any:
+        return self.vector("SCALE", a, factor)
+
+    def sum(self, first: Any, *others: Any) -> Any:
+        for other in others:
+            first = self.vector("ADD", first, other)
+        return first
+
+    def difference(self, a: Any, b: Any) -> Any:
+        return self.vector("SUBTRACT", a, b)
+
+    def normalised(self, a: Any) -> Any:
+        return self.vector("NORMALIZE", a)
+
+    def between(self, factor: Any, a: Any, b: Any) -> Any:
+        """Return the vector a for the factor 0, b for 1."""
+        return self.sum(self.scaled(a, self.subtract(1.0, factor)), self.scaled(b, factor))
+
+    def combined(self, x: Any, y: Any, z: Any = 0.0) -> Any:
+        node = self.node("ShaderNodeCombineXYZ")
+        for socket, value in zip(node.inputs, (x, y, z), strict=True):
+            self.put(socket, value)
+        return node.outputs[0]
+
+    def components(self, a: Any) -> Any:
+        node = self.node("ShaderNodeSeparateXYZ")
+        self.put(node.inputs[0], a)
+        return node.outputs[:3]
+
+    def table(self, image: bpy.types.Image, u: Any, v: Any = 0.5, interpolation: str = "Closest") -> Any:
+        """Return the colour and the alpha of an image at (u, v)."""
+        node = self.node("ShaderNodeTexImage", interpolation=interpolation, extension="EXTEND")
+        node.image = image
+        self.put(node.inputs["Vector"], self.combined(u, v))
+        return node.outputs["Color"], node.outputs["Alpha"]
+
+    def number(self, image: bpy.types.Image, u: Any, v: Any = 0.5) -> Any:
+        """Return a number between those of an image."""
+        return self.components(self.table(image, u, v, "Linear")[0])[0]
+
+    def texel(self, x: Any, count: int) -> Any:
+        """Return the coordinate in an image of `count` numbers, the first for x = 0, the last for x = 1."""
+        return self.math("MULTIPLY_ADD", x, (count - 1) / count, 0.5 / count)
+
+    def random(self, position: Any, seed: float) -> Any:
+        """Return three random numbers; the position of a sample is never twice the same."""
+        node = self.node("ShaderNodeTexWhiteNoise", noise_dimensions="4D")
+        self.put(node.inputs["Vector"], self.scaled(position, 7919.7))
+        node.inputs["W"].default_value = seed
+        return self.components(node.outputs["Color"])
+
+
+class _Grating(_Nodes):
+    def __init__(self, tree: bpy.types.NodeTree, name: str, tables: Mapping[str, np.ndarray]) -> None:
+        super().__init__(tree)
+        self.name, self.tables = name, tables
+        self.orders = "frequencies" in tables
+        self.dielectric = bool((tables["index"].imag == 0).all() and (tables["index"].real > 0).all())
+
+    def image(self, what: str, values: np.ndarray) -> bpy.types.Image:
+        """Return a packed float image of (rows, columns) numbers, or of 4 channels."""
+        if values.ndim == 2:
+            values = np.repeat(values[:, :, None], 4, axis=2)
+        height, width = values.shape[:2]
+        image = bpy.data.images.new(f"{self.name} {what}", width, height, alpha=True, float_buffer=True, is_data=True)
+        image.colorspace_settings.name = "Non-Color"
+        image.alpha_mode = "CHANNEL_PACKED"
+        image.use_half_precision = False
+        image.pixels.foreach_set(np.ascontiguousarray(values, np.float32).ravel())
+        image.update()
+        image.pack()
+        return image
+
+    def build(self) -> None:
+        tables = self.tables
+        inputs = self.node("NodeGroupInput").outputs
+        geometry = self.node("ShaderNodeNewGeometry").outputs
+        position, normal, to_camera = geometry["Position"], geometry["Normal"], geometry["Incoming"]
+        x, y = self.tangents(inputs, normal)
+        of_light, of_order, _ = self.random(position, 0.5)
+
+        # The wavelength, its colour, and the direction from which light of the order comes.
+        colours = tables["colours"][self.space()]
+        edges = tables["edges"]
+        fine = np.interp((np.arange(256) + 0.5) / 256, np.linspace(0, 1, len(edges)), edges)
+        colour = self.table(self.image("colours", np.insert(colours, 3, 1, axis=1)[None]), of_light)[0]
+        wavelength = self.number(self.image("wavelengths", fine[None]), of_light)
+        u_o, v_o, true_c_o = (self.dot(to_camera, axis) for axis in (x, y, normal))
+        c_o = self.larger(true_c_o, 1e-4)
+        q_x, q_y, width_x, width_y, u_power, chance = self.drawn(position, of_order)
+        step_x, step_y = self.multiply(wavelength, q_x), self.multiply(wavelength, q_y)
+        u_i, v_i = self.multiply(self.add(u_o, step_x), -1.0), self.multiply(self.add(v_o, step_y), -1.0)
+        square = self.subtract(self.subtract(1.0, self.multiply(u_i, u_i)), self.multiply(v_i, v_i))
+        propagates = self.multiply(self.math("GREATER_THAN", square, 1e-6), self.math("GREATER_THAN", true_c_o, 1e-4))
+        c_i = self.math("SQRT", self.larger(square, 1e-6))
+        to_light = self.sum(self.scaled(x, u_i), self.scaled(y, v_i), self.scaled(normal, c_i))
+        half = self.normalised(self.sum(to_camera, to_light))
+        c_h = self.larger(self.dot(to_camera, half), 1e-3)
+
+        # Its weight: R K G and the power at κ over the probability, which E bounds.
+        w = self.add(c_i, c_o)
+        slices = tables["powers"].shape[1]
+        kappa = self.multiply(self.divide(inputs["HeightScale"], wavelength), w, 2 * np.pi / float(tables["max_kappa"]))
+        power = self.number(
+            self.image("powers", tables["powers"].T), u_power, self.texel(self.smaller(kappa, 1.0), slices)
+        )
+        square_v = self.add(self.add(self.multiply(step_x, step_x), self.multiply(step_y, step_y)), self.multiply(w, w))
+        k = self.divide(self.multiply(square_v, square_v), self.multiply(4.0, c_i, c_o, w, w))
+        g = self.smaller(self.divide(self.multiply(4.0, w, self.smaller(c_i, c_o)), square_v), 1.0)
+        reflectances = self.image("reflectance", _reflectances(tables["index"]))
+        reflectance = self.number(reflectances, of_light, self.texel(c_h, _COSINES))
+        albedos = self.albedos()
+        azimuth = self.math("MULTIPLY_ADD", self.math("ARCTAN2", v_o, u_o), 0.5 / np.pi, 0.5)
+        albedo = self.number(
+            self.image("albedo", albedos), self.texel(c_o, albedos.shape[1]), self.texel(azimuth, albedos.shape[0])
+        )
+        weight = self.divide(self.multiply(power, chance, k, g, reflectance, propagates), self.larger(albedo, 1.0))
+
+        # The lobe: slopes of facets along the difference of the directions and across, or along x and y of a cell.
+        slope = self.multiply(inputs["Roughness"], wavelength, float(np.sqrt(0.5)))
+        alpha_x = self.smaller(self.larger(self.divide(self.multiply(slope, width_x), c_i), 1e-4), 0.7)
+        alpha_y = self.smaller(self.larger(self.divide(self.multiply(slope, width_y), c_h), 1e-4), 0.7)
+        if self.orders:  # at the mirror direction any axis does
+            along = self.sum(self.difference(to_light, to_camera), self.scaled(x, 1e-4))
+        else:
+            along = self.difference(x, self.scaled(half, self.dot(half, x)))
+        # Blender's anisotropy a makes slopes of ratio (1 - a)², narrower along the tangent for a > 0.
+        ratio = self.divide(self.smaller(alpha_x, alpha_y), self.larger(alpha_x, alpha_y))
+        sign = self.math("SIGN", self.subtract(alpha_y, alpha_x))
+        lobe = self.node("ShaderNodeBsdfAnisotropic", distribution="BECKMANN")
+        self.put(lobe.inputs["Color"], self.scaled(self.vector("MULTIPLY", colour, inputs["Tint"]), weight))
+        self.put(lobe.inputs["Roughness"], self.math("POWER", self.multiply(alpha_x, alpha_y), 0.25))
+        self.put(lobe.inputs["Anisotropy"], self.multiply(self.subtract(1.0, self.math("SQRT", ratio)), sign))
+        self.put(lobe.inputs["Normal"], half)
+        self.put(lobe.inputs["Tangent"], self.normalised(along))
+        shaded = lobe.outputs[0]
+        if self.dielectric:
+            entering = self.subtract(1.0, self.number(reflectances, of_light, self.texel(c_o, _COSINES)))
+            diffuse, both = self.node("ShaderNodeBsdfDiffuse"), self.node("ShaderNodeAddShader")
+            factor = self.multiply(entering, _entering(tables["index"]))
+            self.put(diffuse.inputs["Color"], self.scaled(inputs["BaseColor"], factor))
+            self.put(both.inputs[0], shaded)
+            self.put(both.inputs[1], diffuse.outputs[0])
+            shaded = both.outputs[0]
+        self.put(self.node("NodeGroupOutput").inputs["BSDF"], shaded)
+
+    def space(self) -> int:
+        names = list(map(str, self.tables["spaces"]))
+        if (space := working_space()) not in names:
+            raise ValueError(f"the working space of this file is {space}, wanted one of {', '.join(names)}")
+        return names.index(space)
+
+    def tangents(self, inputs: Any, normal: Any) -> tuple[Any, Any]:
+        """Return the x and y axes of the pattern."""
+
+        def in_world(a: Any) -> Any:
+            node = self.node(
+                "ShaderNodeVectorTransform", vector_type="VECTOR", convert_from="OBJECT", convert_to="WORLD"
+            )
+            self.put(node.inputs["Vector"], a)
+            return node.outputs[0]
+
+        at = self.components(self.node("ShaderNodeTexCoord").outputs["Object"])
+        given = self.math("GREATER_THAN", self.vector("LENGTH", inputs["Tangent"]), 0.0)
+        tangent = self.between(given, in_world((1.0, 0.0, 0.0)), inputs["Tangent"])
+        tangent = self.between(inputs["Radial"], tangent, in_world(self.combined(at[0], at[1])))
+        tangent = self.normalised(self.difference(tangent, self.scaled(normal, self.dot(normal, tangent))))
+        turned = self.math("RADIANS", inputs["Orientation"])
+        across = self.vector("CROSS_PRODUCT", normal, tangent)
+        x = self.sum(self.scaled(tangent, self.math("COSINE", turned)), self.scaled(across, self.math("SINE", turned)))
+        return x, self.vector("CROSS_PRODUCT", normal, x)
+
+    def drawn(self, position: Any, of_order: Any) -> tuple[Any, Any, Any, Any, Any, Any]:
+        """Return q and its widths, the coordinate of its powers, and one over its probability."""
+        count, width = len(self.tables["powers"]), float(self.tables["lobe_width"])
+        if self.orders:
+            slots = self.image("orders", _slots(self.tables))
+            values, chance = self.table(slots, of_order)
+            q_x, q_y, u_power = self.components(values)
+            return q_x, q_y, width, width, u_power, chance
+        rows, columns = self.tables["rows"], self.tables["columns"]
+        low, high = (np.repeat(edges, columns.shape[1] - 1) for edges in (rows[:-1], rows[1:]))
+        cells = np.stack([columns[:, :-1].ravel(), columns[:, 1:].ravel(), low, high], axis=-1)
+        cell = self.smaller(self.math("FLOOR", self.multiply(of_order, float(count))), count - 1.0)
+        u_cell = self.divide(self.add(cell, 0.5), float(count))
+        values, top = self.table(self.image("cells", cells[None]), u_cell)
+        left, right, bottom = self.components(values)
+        along_x, along_y, _ = self.random(position, 17.5)
+        size_x, size_y = self.subtract(right, left), self.subtract(top, bottom)
+        return (
+            self.math("MULTIPLY_ADD", size_x, along_x, left),
+            self.math("MULTIPLY_ADD", size_y, along_y, bottom),
+            self.larger(self.multiply(size_x, 0.35), width),
+            self.larger(self.multiply(size_y, 0.35), width),
+            u_cell,
+            1.0,
+        )
+
+    def albedos(self) -> np.ndarray:
+        """Return what a perfect mirror would reflect, by azimuth of ω_o and cos θ_o."""
+        if not self.orders:
+            return self.tables["albedo"].mean(axis=0)
+        return _albedos_of_orders(self.tables)
+
+
+def _middle(tables: Mapping[str, np.ndarray]) -> np.ndarray:
+    return (tables["edges"][1:] + tables["edges"][:-1]) / 2
+
+
+def _slots(tables: Mapping[str, np.ndarray]) -> np.ndarray:
+    """Return (1, slots, 4): q_x, q_y, the coordinate of the powers, one over the probability of the order.
+
+    The probability is that of the root mean square of the power over the κ of visible light, which has the least noise
+    of all that do not depend on κ.
+    """
+    powers = tables["powers"]
+    count, slices = powers.shape
+    kappa = (2 * np.pi / _middle(tables)[:, None] * np.linspace(0.8, 2, 13)).ravel() / float(tables["max_kappa"])
+    at = np.minimum(kappa, 1) * (slices - 1)
+    below = np.minimum(at.astype(int), slices - 2)
+    shown = powers[:, below] * (1 - at + below) + powers[:, below + 1] * (at - below)
+    weights = np.sqrt((shown**2).mean(axis=1))
+    numbers = np.maximum(1, np.round(weights / weights.sum() * (_SLOTS - count))).astype(int)
+    order = np.repeat(np.arange(count), numbers)
+    chances = len(order) / numbers[order]
+    return np.column_stack([tables["frequencies"][order], (order + 0.5) / count, chances])[None]
+
+
+def _albedos_of_orders(tables: Mapping[str, np.ndarray]) -> np.ndarray:
+    q, powers, wavelengths = tables["frequencies"], tables["powers"], _middle(tables)[::4, None]
+    slices = powers.shape[1]
+    albedo = np.zeros((_AZIMUTHS, _ALBEDO_COSINES))
+    for j, i in np.ndindex(albedo.shape):
+        c_o, azimuth = max(i / (_ALBEDO_COSINES - 1), 0.02), (2 * j / (_AZIMUTHS - 1) - 1) * np.pi
+        sine = np.sqrt(1 - c_o**2)
+        u_i = sine * np.cos(azimuth) + wavelengths * q[:, 0]
+        v_i = sine * np.sin(azimuth) + wavelengths * q[:, 1]
+        square = 1 - u_i**2 - v_i**2
+        c_i = np.sqrt(np.maximum(square, 1e-8))
+        w = c_i + c_o
+        square_v = wavelengths**2 * (q**2).sum(axis=1) + w**2
+        k_g = square_v**2 / (4 * c_i * c_o * w**2) * np.minimum(1, 4 * w * np.minimum(c_i, c_o) / square_v)
+        at = np.minimum(2 * np.pi * w / wavelengths / float(tables["max_kappa"]), 1) * (slices - 1)
+        below = np.minimum(at.astype(int), slices - 2)
+        order = np.arange(len(q))
+        power = powers[order, below] * (1 - at + below) + powers[order, below + 1] * (at - below)
+        albedo[j, i] = (power * k_g * (square > 1e-8)).sum(axis=1).mean()
+    return albedo
+
+
+def _reflectances(index: np.ndarray) -> np.ndarray:
+    """Return the mean reflectance of both polarisations, (cosines, bins); an index of 0 is the perfect mirror."""
+    cosine = np.maximum(np.linspace(0, 1, _COSINES), 1e-6)[:, None]
+    root = np.sqrt(index.astype(complex) ** 2 - 1 + cosine**2)
+    s = (cosine - root) / (cosine + root)
+    mirror = index == 0
+    square = np.where(mirror, 1, index.astype(complex) ** 2)
+    p = (square * cosine - root) / (square * cosine + root)
+    return np.where(mirror, 1.0, (np.abs(s) ** 2 + np.abs(p) ** 2) / 2)
+
+
+def _entering(index: np.ndarray) -> float:
+    """Return the fraction of diffuse light that enters a dielectric."""
+    cosine = np.linspace(0, 1, _COSINES)
+    reflectance = _reflectances(index).mean(axis=1) * 2 * cosine
+    return 1 - float(((reflectance[1:] + reflectance[:-1]) / 2).mean())

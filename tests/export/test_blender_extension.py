@@ -1,0 +1,106 @@
+"""The extension of Blender: its line gratings, and, if Blender's Python package is there, its installation."""
+
+import importlib.metadata
+import importlib.util
+import json
+import os
+import subprocess
+import sys
+import zipfile
+from pathlib import Path
+
+import numpy as np
+import pytest
+from scipy.special import jv
+
+from mitsuba_diffraction.export import blender_extension
+
+ASSETS = Path(blender_extension.__file__).parent / "assets" / "blender"
+BLENDER = os.environ.get("BPY_PYTHON") or (sys.executable if importlib.util.find_spec("bpy") else None)
+needs_blender = pytest.mark.skipif(
+    BLENDER is None, reason="needs Blender's package bpy, here or in the Python that BPY_PYTHON names"
+)
+BASE = {"edges": np.linspace(0.39, 0.72, 49), "colours": np.ones((1, 48, 3)), "spaces": ["-"], "index": np.zeros(48)}
+
+
+def line_grating(*arguments):
+    """`line_grating` of the extension, which Blender imports as a module of its own."""
+    spec = importlib.util.spec_from_file_location("line_gratings_of_extension", ASSETS / "line_gratings.py")
+    module = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(module)
+    return module.line_grating(*arguments, BASE)
+
+
+def test_line_gratings_have_their_closed_forms():
+    period, depth = 1.6, 0.2
+    for profile, duty in (("sinusoidal", 0.5), ("blazed", 0.5), ("lamellar", 0.25)):
+        tables = line_grating(profile, period, depth, duty)
+        order = np.round(tables["frequencies"][:, 0] * period)[:, None]
+        kappa = np.linspace(0, float(tables["max_kappa"]), tables["powers"].shape[1])
+        expected = {
+            "sinusoidal": jv(order, kappa * depth / 2) ** 2,
+            "blazed": np.sinc(kappa * depth / (2 * np.pi) - order) ** 2,
+            "lamellar": np.where(
+                order == 0,
+                1 - 4 * duty * (1 - duty) * np.sin(kappa * depth / 2) ** 2,
+                (2 * duty * np.sinc(order * duty) * np.sin(kappa * depth / 2)) ** 2,
+            ),
+        }[profile]
+        np.testing.assert_allclose(tables["powers"], expected, atol=2e-3)
+
+
+@pytest.mark.parametrize(
+    ("line", "message"),
+    [
+        ("export -o s.osl", "SURFACE: got none for s.osl, wanted a surface, or -o with a file .zip"),
+        ("export foil -o s.zip", "-o"),
+    ],
+)
+def test_an_extension_is_of_no_surface(line, message, command, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    code, _, error = command(line)
+    assert code == 2
+    assert message in error
+    assert not list(tmp_path.iterdir())
+
+
+@pytest.fixture(scope="session")
+def extension(tmp_path_factory):
+    path = tmp_path_factory.mktemp("extension") / "diffraction_gratings.zip"
+    blender_extension.write_extension(path)
+    return path
+
+
+@pytest.mark.slow
+def test_the_extension_holds_its_licences_and_version(extension):
+    with zipfile.ZipFile(extension) as archive:
+        version = importlib.metadata.version("mitsuba_diffraction")
+        assert f'version = "{version}"' in archive.read("blender_manifest.toml").decode()
+        assert b"BSD 3-Clause" in archive.read("LICENSE")
+        assert b"MIT" in archive.read("tables/LICENSE-of-skins.txt")
+    assert extension.stat().st_size < 1e6
+
+
+@pytest.mark.slow
+@needs_blender
+def test_the_extension_is_installed_and_makes_each_material(extension, command, tmp_path):
+    tables = tmp_path / "mine.npz"
+    code, _, error = command("export", "sinusoidal,period=1.6,depth=0.15,material=Al", "-o", str(tables))
+    assert code == 0, error
+    where = {**os.environ, "BLENDER_USER_RESOURCES": str(tmp_path / "user")}
+    (tmp_path / "user").mkdir()
+    script = Path(__file__).with_name("extension_in_blender.py")
+    words = [BLENDER, script, extension, tables, tmp_path / "saved.blend"]
+    done = subprocess.run(list(map(str, words)), capture_output=True, text=True, timeout=300, env=where)
+    line = next((each for each in done.stdout.splitlines() if each.startswith("FOUND ")), None)
+    assert line, done.stdout + done.stderr
+    found = json.loads(line.removeprefix("FOUND "))
+    assert found["valid"]
+    surfaces = found["surfaces"]
+    assert {name for name, of in surfaces.items() if of["radial"]} == {"compact_disc", "dvd"}
+    assert all(of["tangent"] for of in surfaces.values())
+    assert surfaces["file"]["name"] == "mine"
+    assert [message.count("\n") for message in found["messages"]] == [1, 1, 1]
+    assert "/gone.npz: No such file" in found["messages"][0]
+    assert "not tables of mitsuba-diffraction export -o NAME.npz" in found["messages"][1]
+    assert found["mean"] > 0.01  # the file, opened again and rendered, without the extension
