@@ -286,3 +286,22 @@ def test_a_screen_casts_a_shadow(exported, tab):
     light, shadow = (call(tab, "plane", "skin.bin", {**shown, "shadow": s})[:, :3] for s in (False, True))
     assert not tab.messages, "\n".join(tab.messages)[:3000]
     assert shadow.sum() < 0.02 * light.sum()
+
+
+@pytest.mark.slow
+def test_a_base_is_lit_through_the_surface(folder, exported, tab):
+    surface, colours = exported("skin")
+    write_colours(surface, folder / "base.bin", base="#a0522d")
+    position = np.array([-0.5, 2.1, 3.0])
+    shown = {"eye": EYE.tolist(), "position": position.tolist(), "size": SIZE, "material": {}, "light": "directional"}
+    found = call(tab, "plane", "base.bin", shown)[:, :3] @ SRGB_TO_XYZ.T
+    assert not tab.messages
+    points = seen()
+    wi, wo = np.broadcast_to(unit(position), points.shape), unit(EYE - points)
+    srgb = np.array([0xA0, 0x52, 0x2D]) / 255
+    below = (((srgb + 0.055) / 1.055) ** 2.4) @ SRGB_TO_XYZ.T
+    through = face(wi[:, 2], 1.5) * face(wo[:, 2], 1.5) * wi[:, 2] / np.pi
+    frame = axes(points, 0, radial=False)
+    wanted = mixed(lit(surface, colours, points, frame, position, "directional") + through[:, None] * below)
+    inside = (np.abs(points[:, :2]) < 0.9).all(axis=1)
+    assert difference(found[inside], wanted[inside]).mean() < 0.3
