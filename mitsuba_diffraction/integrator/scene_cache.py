@@ -10,14 +10,16 @@ import mitsuba as mi
 import numpy as np
 
 Made = TypeVar("Made")
+MAX_COMPARED = 16  # entries of a parameter
 
 
 class SceneCache:
     """Numbers and arrays that follow from the parameters of a scene and its sensor.
 
-    A parameter has changed if it is another array of Dr.Jit. The arrays are held, so that no other gets their index,
-    and operations in place make copies. What is made must not hold the scene, its shapes or BSDFs: it is kept by the
-    integrator, which the scene holds.
+    A parameter has changed if it is another array of Dr.Jit or, where it has at most `MAX_COMPARED` entries, if these
+    are other numbers, as NumPy can write them in place; in larger arrays, such as vertices, that goes unnoticed. The
+    arrays are held, so that no other gets their index, and operations of Dr.Jit in place make copies. What is made must
+    not hold the scene, its shapes or BSDFs: it is kept by the integrator, which the scene holds.
     """
 
     def __init__(self) -> None:
@@ -41,5 +43,8 @@ class SceneCache:
 
 
 def _identity(value: Any) -> Any:
-    """Return the indices of the arrays in a parameter, or its numbers."""
-    return dr.detail.collect_indices(value) or (np.array(value).tolist() if dr.is_array_v(value) else value)
+    """Return the indices of the arrays in a parameter, its numbers if they are few, or what else it is."""
+    indices = dr.detail.collect_indices(value)
+    if indices and dr.width(value) > MAX_COMPARED:
+        return indices
+    return indices, np.array(dr.detach(value)).tolist() if dr.is_array_v(value) else value

@@ -109,6 +109,16 @@ def test_an_updated_scene_has_the_guide_and_candidates_of_one_loaded_anew(name):
         assert not found
 
 
+def test_numbers_written_through_numpy_are_noticed():
+    scene = loaded()
+    guide_and_slots(scene)
+    parameters = mi.traverse(scene)
+    parameters["lamp.emitter.radiance.value"].numpy()[:] = 20.0
+    parameters.update()
+    for a, b in zip(guide_and_slots(scene), guide_and_slots(loaded(radiance=20.0)), strict=True):
+        np.testing.assert_allclose(a, b, rtol=1e-5)
+
+
 @pytest.mark.slow
 @pytest.mark.parametrize("name", UPDATES)
 def test_a_frame_after_an_update_is_that_of_a_scene_loaded_anew(name):
