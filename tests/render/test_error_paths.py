@@ -130,7 +130,8 @@ class Fails:
         return None
 
     def wait_for_workers(self, *_, **__):
-        return None
+        if isinstance(self.error, asyncio.TimeoutError):
+            raise self.error
 
     @property
     def scheduler(self):
