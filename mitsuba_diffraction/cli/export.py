@@ -9,7 +9,7 @@ from typing import Annotated
 
 import typer
 
-from ..errors import RequestError
+from ..errors import RequestError, operand, shell_command
 from ..export.blender_extension import write_extension
 from ..export.colour_file import check_base, write_colours
 from ..export.colour_table import Viewed
@@ -91,7 +91,7 @@ def export(
     check_suffix("-o", output, _COLOURS, *_SHADERS, *_RANGES)
     ranges = {"wavelength": wavelength, "angle": angle, "azimuth": azimuth}
     given = {key: text for key, text in ranges.items() if text is not None}
-    _refuse_parameters_of_scenes(requested, output)
+    _refuse_parameters_of_scenes(requested, surface, output)
     check_outputs(requested.files, [("-o", output)], overwrite=overwrite)
     if output.suffix.lower() not in _RANGES:
         if given:
@@ -112,12 +112,15 @@ def _write_extension(output: Path, overwrite: bool) -> None:
     tell(f"{output}: {held}")
 
 
-def _refuse_parameters_of_scenes(requested: RequestedSurface, output: Path) -> None:
+def _refuse_parameters_of_scenes(requested: RequestedSurface, surface: str, output: Path) -> None:
     """Refuse parameters of the plugin that files for other programs do not hold, and name what does."""
     is_shader, has_colours = output.suffix.lower() in _SHADERS, output.suffix.lower() == _COLOURS
     for key in _IN_SCENES:
         if key in requested.aside and not (has_colours and key in _OF_COLOURS):
             instead = f"set the input {_INPUTS[key]} of the shader" if is_shader and key in _INPUTS else ""
+            if key == "transmission" and output.suffix.lower() == ".csv":
+                command = shell_command("mitsuba-diffraction", "efficiency", surface, "--csv", operand(str(output)))
+                instead = f"it holds orders in reflection; {command} has those in transmission"
             instead = instead or "wanted it without; scenes and `render --material` have it"
             raise RequestError(f"{key}: got {requested.aside[key]}, which {output} does not hold; {instead}")
 

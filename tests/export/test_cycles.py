@@ -88,7 +88,11 @@ def test_a_continuum_holds_all_of_its_power_in_cells(tmp_path):
             "got 90, which s.osl does not hold; set the input Orientation of the",
         ),
         ("export blazed,thin_film_thickness=0.1 -o s.osl", "scenes and `render --material` have it"),
-        ("export blazed,transmission=sheet -o s.csv", "got sheet, which s.csv does not hold; wanted it without"),
+        (
+            "export blazed,transmission=sheet -o s.csv",
+            "got sheet, which s.csv does not hold; it holds orders in reflection; "
+            "mitsuba-diffraction efficiency blazed,transmission=sheet --csv s.csv has those in transmission",
+        ),
         ("export blazed -o s.osl --angle 0,30", "--angle: s.osl holds all directions and colours, wanted it without"),
         ("export blazed,material=Unobtainium -o s.osl", "Unobtainium"),
         ("export gone.exr -o s.osl", "gone.exr"),
