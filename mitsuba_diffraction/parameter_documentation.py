@@ -1,4 +1,4 @@
-"""Parameters of a plugin, from which its docstring and docs/plugin.md are made."""
+"""Parameters of a plugin, from which its docstring and its page of the manual are made."""
 
 from __future__ import annotations
 

@@ -25,8 +25,13 @@ from mitsuba_diffraction.shader_2014.quirks import Quirks
 ROOT = Path(__file__).parents[1]
 PACKAGE = Path(md.__file__).parent
 PAGES = [ROOT / "README.md", *sorted((ROOT / "docs").glob("*.md"))]
-SLOW = {"compare", "design", "export", "index", "long_renders", "own_grating", "own_scan", "plugin", "python", "viewer"}
+SLOW = {
+    *("compare", "derivatives", "design", "export", "index", "long_renders", "materials", "own_grating", "own_scan"),
+    *("plugin", "python", "viewer"),
+}
 """Pages whose code takes long."""
+WAY_IN = ("index", "gallery", "blender", "viewer", "own_scan", "own_grating", "design", "plugin", "python")
+"""Pages that are read; the others are for looking something up."""
 BLOCK = re.compile(r"^(?P<indent> *)```(?P<language>\w+)\n(?P<body>.*?)^ *```$", re.DOTALL | re.MULTILINE)
 REDUCED = {
     "design": {"--texels": "8", "--starts": "1"},
@@ -188,13 +193,15 @@ def test_a_wrong_block_of_code_is_found(folder, command, llvm, capfd):
 
 def test_the_tables_of_the_manual_are_those_of_the_plugins(llvm):
     """If they are not: python tools/manual/parameter_tables.py."""
-    with_tables = runpy.run_path(str(ROOT / "tools" / "manual" / "parameter_tables.py"))["with_tables"]
+    tables = runpy.run_path(str(ROOT / "tools" / "manual" / "parameter_tables.py"))
+    for name in tables["PAGES"]:
+        text = (ROOT / "docs" / name).read_text(encoding="utf-8")
+        assert tables["with_tables"](name, text) == text
     text = (ROOT / "docs" / "plugin.md").read_text(encoding="utf-8")
-    assert with_tables(text) == text
     with pytest.raises(KeyError, match="'material_'"):
-        with_tables(text.replace("| `material` |", "| `material_` |"))
+        tables["with_tables"]("plugin.md", text.replace("| `material` |", "| `material_` |"))
     with pytest.raises(ValueError, match="no row for material"):
-        with_tables(re.sub(r"^\| `material` \|.*\n", "", text, flags=re.MULTILINE))
+        tables["with_tables"]("plugin.md", re.sub(r"^\| `material` \|.*\n", "", text, flags=re.MULTILINE))
 
 
 def test_the_manual_lists_what_rigorous_theory_refuses():
@@ -272,6 +279,21 @@ def test_the_manual_begins_with_the_pages_of_the_readme():
 
 def test_the_readme_is_short():
     assert len(PAGES[0].read_text(encoding="utf-8").splitlines()) <= 140
+
+
+def words(page):
+    """As `wc -w` counts them, with marks of tables and addresses of links, without blocks of code."""
+    text = BLOCK.sub("", (ROOT / "docs" / f"{page}.md").read_text(encoding="utf-8"))
+    return len(re.sub(r"^    mitsuba-diffraction .*$", "", text, flags=re.MULTILINE).split())
+
+
+def test_the_way_into_the_manual_has_at_most_12_000_words():
+    counts = {page: words(page) for page in WAY_IN}
+    assert sum(counts.values()) <= 12_000, counts
+
+
+def test_the_page_of_doubts_has_at_most_900_words():
+    assert words("trust") <= 900
 
 
 def test_what_the_page_on_the_thesis_names_exists(command):

@@ -70,15 +70,15 @@ PARAMETERS = (
         "int_ior, ext_ior",
         "float or string",
         "a dielectric: a number or a name, as in Mitsuba's `dielectric`; `int_ior` also a [medium with dispersion or a "
-        f"file](#refractive-indices): {', '.join(f'`{name}`' for name in DISPERSION)}, or a table (`.spd`, `.csv`, "
-        "`.yml`)",
+        f"file](materials.md#refractive-indices): {', '.join(f'`{name}`' for name in DISPERSION)}, or a table "
+        "(`.spd`, `.csv`, `.yml`)",
         "1.5, air",
     ),
     Parameter(
         "material",
         "string",
         "a conductor instead: a name as in Mitsuba's `conductor`, or `Ti` (Johnson and Christy 1974), or a "
-        "[file](#refractive-indices), or `none` for a perfect mirror, R = 1",
+        "[file](materials.md#refractive-indices), or `none` for a perfect mirror, R = 1",
     ),
     Parameter(
         "eta, k",
@@ -88,9 +88,10 @@ PARAMETERS = (
     Parameter(
         "thin_film_thickness",
         "float, texture or string",
-        "thickness of a [film on the relief](#a-thin-film), µm along the normal; a string is the file of a picture, "
-        "whose integers are from 0 (black) to 1 µm (white), or a list of the thicknesses of [several "
-        f"films](#a-stack-of-films), from the outside in, at most {MAX_THICKNESS:g} in all. Scalar theory only",
+        "thickness of a [film on the relief](materials.md#a-thin-film), µm along the normal; a string is the file of a "
+        "picture, whose integers are from 0 (black) to 1 µm (white), or a list of the thicknesses of [several "
+        f"films](materials.md#a-stack-of-films), from the outside in, at most {MAX_THICKNESS:g} in all. Scalar theory "
+        "only",
         "0",
     ),
     Parameter(

@@ -8,7 +8,7 @@ multiplied by
 which is reciprocal, and one where a ≤ 1 for both directions. The table holds e at nodes and is linear between them.
 Where e is smaller at the centre of a grid cell than the mean of its corners, the corners are lowered by the difference.
 This is needed because a varies fast where an order is just above the horizon, and in deep reliefs. E is a safeguard of
-the model; docs/plugin.md has measured albedos.
+the model; docs/materials.md has measured albedos.
 
 For a line grating of period T, with c = √(1 − ω_y²) and
 

@@ -15,7 +15,7 @@ from ..settings import MIN_WAVELENGTH, VISIBLE
 from .far_field import blurred_texels
 
 _MAX_TEXELS = 256
-_ORDERS_PER_STROKE = 3.0  # of the finest strokes of a picture; see the eye chart in docs/design.md
+_ORDERS_PER_STROKE = 3.0  # of the finest strokes of a picture; see the eye chart in docs/designed_reliefs.md
 MIN_STROKES = 4 / _ORDERS_PER_STROKE  # of a plate whose period is two orders across half the picture
 _MAX_ANGLE = 30.0  # degrees, that `for_detail` takes
 _MAX_PATH = 16.0  # largest path difference in wavelengths; deeper reliefs are far outside of scalar theory

@@ -38,7 +38,7 @@ def test_scalar_theory_predicts_the_light_in_the_picture(case):
 
 @pytest.mark.slow
 def test_the_page_has_rows_of_the_table():
-    page = (ROOT / "docs" / "design.md").read_text(encoding="utf-8").splitlines()
+    page = (ROOT / "docs" / "designed_reliefs.md").read_text(encoding="utf-8").splitlines()
     table = {line for line in page if line.startswith(("| reflected |", "| transmitted |"))}
     assert len(table) == 4
     assert table <= set(designed_plates.rows())

@@ -37,7 +37,7 @@ def test_media_have_their_published_indices(name, wavelength, n, within):
 
 
 def test_the_manual_lists_the_media():
-    page = (Path(__file__).parents[2] / "docs" / "plugin.md").read_text()
+    page = (Path(__file__).parents[2] / "docs" / "materials.md").read_text()
     rows = dict(re.findall(r"^\| `(\w+)` \| (1\.[\d., ]+) \|", page, re.MULTILINE))
     assert rows.keys() == DISPERSION.keys()
     for name, values in rows.items():

@@ -1,8 +1,8 @@
 """Compare designed plates with Maxwell's equations: `python tools/data/designed_plates.py [OUT.json]`.
 
 Small plates of glass are designed for a picture; the efficiencies of all their orders are computed by
-`volume_integral`, five minutes of processor time. The tests and the table of docs/design.md read the result. `python
-tools/data/designed_plates.py table` prints the table.
+`volume_integral`, five minutes of processor time. The tests and the table of docs/designed_reliefs.md read the
+result. `python tools/data/designed_plates.py table` prints the table.
 """
 
 from __future__ import annotations
@@ -148,7 +148,7 @@ def of_case(case: dict[str, Any]) -> Design:
 
 
 def rows() -> list[str]:
-    """Return the rows of a table, of which docs/design.md has some, with the ranges over the wavelengths."""
+    """Return the rows of a table, of which docs/designed_reliefs.md has some, with the ranges over the wavelengths."""
 
     def between(values: list[float], digits: int, unit: float = 1.0) -> str:
         first, last = (f"{value / unit:.{digits}f}" for value in (min(values), max(values)))

@@ -3,7 +3,7 @@
     git clone https://github.com/polyanskiy/refractiveindex.info-database
     python tools/data/index_pages.py refractiveindex.info-database/database/data
 
-Lists the refused ones with the reason. docs/plugin.md has the counts. The values of all formulas are tested in
+Lists the refused ones with the reason. docs/materials.md has the counts. The values of all formulas are tested in
 tests/optics/test_indices.py.
 """
 

@@ -1,4 +1,4 @@
-"""Print the table of docs/plugin.md on the conservation of energy: `python tools/manual/albedo_table.py [NAME …]`."""
+"""Print the table of docs/materials.md on the conservation of energy: `albedo_table.py [NAME …]`."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Print the tables of docs/design.md: what depth, levels, texels and time bring, and other targets.
+"""Print the tables of docs/designed_reliefs.md: what depth, levels, texels and time bring, and other targets.
 
     python tools/manual/design_table.py           # all rows
     python tools/manual/design_table.py cat ring  # those whose names contain one of the words

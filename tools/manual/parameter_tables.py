@@ -1,9 +1,9 @@
-"""The tables of parameters in docs/plugin.md, from the descriptions of the plugins.
+"""The tables of parameters in docs/plugin.md and docs/integrators.md, from the descriptions of the plugins.
 
     python tools/manual/parameter_tables.py
 
-writes the page again. A table of the page is a list of names; types, meanings and defaults are those of `PARAMETERS` of
-the plugin that the heading above names, or of `diffraction_grating`.
+writes the pages again. A table of a page is a list of names; types, meanings and defaults are those of `PARAMETERS` of
+the plugin that the heading above names, or of the first plugin of the page.
 """
 
 from __future__ import annotations
@@ -15,23 +15,25 @@ from mitsuba_diffraction.integrator import diffraction_path
 from mitsuba_diffraction.parameter_documentation import Parameter
 from mitsuba_diffraction.shader_2014 import diffraction_shader
 
-PAGE = Path(__file__).parents[2] / "docs" / "plugin.md"
-PLUGINS = {module.__name__.rpartition(".")[2]: module for module in (diffraction_path, diffraction_shader)}
+DOCS = Path(__file__).parents[2] / "docs"
+PAGES = {"plugin.md": (diffraction_grating,), "integrators.md": (diffraction_path, diffraction_shader)}
+"""The plugins that a page describes."""
 
 
-def with_tables(text: str) -> str:
-    """Return the page with the rows of its tables renewed.
+def with_tables(name: str, text: str) -> str:
+    """Return the text of the page of `PAGES` with the rows of its tables renewed.
 
     Raises:
         KeyError: if a table names an unknown parameter.
         ValueError: if a parameter is in no table.
     """
-    lines, module, columns, missing = [], diffraction_grating, 0, set[Parameter]()
-    for plugin in (diffraction_grating, *PLUGINS.values()):
+    plugins = {module.__name__.rpartition(".")[2]: module for module in PAGES[name]}
+    lines, module, columns, missing = [], PAGES[name][0], 0, set[Parameter]()
+    for plugin in plugins.values():
         missing |= set(plugin.PARAMETERS)
     for line in text.splitlines():
         if line.startswith("## "):
-            module = next((PLUGINS[name] for name in PLUGINS if f"`{name}`" in line), diffraction_grating)
+            module = next((plugins[plugin] for plugin in plugins if f"`{plugin}`" in line), PAGES[name][0])
         if line.startswith("| parameter |"):
             columns = line.count("|") - 1
         elif not line.startswith("|"):
@@ -45,9 +47,10 @@ def with_tables(text: str) -> str:
             line = f"| {' | '.join(cells)} |".replace("|  |", "| |")
         lines.append(line)
     if missing:
-        raise ValueError(f"{PAGE}: got no row for {', '.join(sorted(parameter.name for parameter in missing))}")
+        raise ValueError(f"{name}: got no row for {', '.join(sorted(parameter.name for parameter in missing))}")
     return "\n".join([*lines, ""])
 
 
 if __name__ == "__main__":
-    PAGE.write_text(with_tables(PAGE.read_text(encoding="utf-8")), encoding="utf-8")
+    for page in PAGES:
+        (DOCS / page).write_text(with_tables(page, (DOCS / page).read_text(encoding="utf-8")), encoding="utf-8")

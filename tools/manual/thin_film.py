@@ -1,4 +1,4 @@
-"""Figures of docs/plugin.md: a hologram with films, anodised titanium, and the stack of films of a jewel beetle.
+"""Figures of docs/materials.md: a hologram with films, anodised titanium, and the stack of films of a jewel beetle.
 
 python tools/manual/thin_film.py docs/thin_film.png docs/film_stack.png
 

@@ -1,4 +1,4 @@
-"""Print the table of docs/viewer.md: the time of a frame of the live view, of this model and of the shader of 2014.
+"""Print the table of docs/speed.md on the live view: the time of a frame, of this model and of the shader of 2014.
 
     python tools/manual/viewer_speed.py
 
