@@ -57,8 +57,9 @@ finds much of this light in the picture, to 64, where it finds little; the numbe
 `path`, a light without extent is not seen in a mirror: it is omitted where the grating next to it scatters by a delta
 component.
 
-Instances and curves count as X, but direct light at an instance is drawn as that at a grating. So do shapes on which
-rays do not find the points that Mitsuba draws there, as on a sphere with a scale that is not uniform.
+Instances, curves, `sdfgrid` and `ellipsoids` count as X, and so do shapes on which rays do not find the points that
+Mitsuba draws there, as on a sphere with a scale that is not uniform. Direct light at an instance is drawn as that at a
+grating.
 
 Without a grating, with max_depth of 0 or 1, in polarised variants, and for sensors other than `perspective` and
 `thinlens`, this is `path`. So it is with max_depth of 2 where all lights have an extent and are about as bright in all

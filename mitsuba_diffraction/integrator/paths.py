@@ -54,7 +54,7 @@ class Gratings:
     """The shapes whose BSDF is or holds a `diffraction_grating` and on which points can be drawn by area.
 
     A shape counts as a whole, whichever component of its BSDF reflects: both sides of `twosided`, all of a blend, and
-    the base. Instances and curves, on which Mitsuba draws no points, do not count.
+    the base. Shapes on which Mitsuba draws no points do not count, as instances, curves, `sdfgrid` and `ellipsoids`.
 
     Attributes:
         shapes: list of `mi.Shape`.

@@ -3,18 +3,23 @@
 Each is a file of XML, loaded once for `diffraction_path` and once for Mitsuba's integrator; and twice more, for a frame
 after an update of some parameters, with or without a frame before it. A seed gives the same scene. It draws
 
-- one or two gratings: line profiles, skins with a continuum; of metals, dielectrics, with a film, a coat,
+- one or two gratings: line profiles, crossed ones, skins with a continuum; of metals, dielectrics, with a film, a coat,
   a base, transmission as interface or sheet; bare or in `twosided`, `mask`, `blendbsdf`, `normalmap`, `bumpmap`; turned
   by a number or a texture
-- on `rectangle`, `disk`, `sphere`, `cylinder`, `cube`, `ply` (a bent sheet with UVs), `instance`, `bsplinecurve`; some
-  flipped, some under a transform that shears
+- on `rectangle`, `disk`, `sphere`, `cylinder`, `cube`, `ply` and `obj` (a bent sheet with UVs), `instance`,
+  `bsplinecurve`, `linearcurve`, `sdfgrid`, `ellipsoids`, `ellipsoidsmesh`; some flipped, some under a transform that
+  shears
 - a floor, at times a wall that shares its BSDF (which Mitsuba merges), and at times another object: `diffuse` with
   each kind of spectrum and texture, `plastic`, `roughplastic`, `conductor`, `roughconductor`, `dielectric`,
-  `roughdielectric`, `thindielectric`, `principled`, `null`, `mask`, `blendbsdf`, `twosided`, `normalmap`, `bumpmap`
+  `roughdielectric`, `thindielectric`, `principled`, `principledthin`, `hair`, `null`, `mask`, `blendbsdf`, `twosided`,
+  `normalmap`, `bumpmap`
 - one to three lights of several `sampling_weight`s: `area` on each shape and with a texture, `directionalarea`,
   `constant`, `envmap`, `sunsky`, `directional`, `point`, `spot`, `projector`
 - `perspective`, at times with a shifted principal point, `thinlens`, `orthographic`; each sampler and filter of
   reconstruction; a crop window; depths from 2 to 6 or no limit, with Russian roulette from 3 or 5.
+
+It draws no participating media, which `path` and `diffraction_path` do not render, and no `timed_sunsky`, which no
+integrator of Mitsuba 3.9.1 renders in `llvm_ad_spectral`.
 
 Lobes are wide, and lamps that are seen in mirrors large, so that `path` converges.
 """
@@ -35,6 +40,8 @@ from mitsuba_diffraction.render.scene_file import SceneFile
 
 SECONDS = 3.0  # of all pictures of a scene
 LONGER = 8  # times as long, of a second look with other seeds
+SHAPES = ("rectangle", "disk", "sphere", "cylinder", "cube", "ply", "obj")
+OTHER_SHAPES = ("bsplinecurve", "linearcurve", "sdfgrid", "ellipsoids", "ellipsoidsmesh")
 
 
 @functools.cache
@@ -43,6 +50,7 @@ def spectra(folder: Path) -> dict[str, Path]:
     surfaces = {
         "blazed": (md.gratings.blazed(2.5, 0.25), 1.5),
         "sinusoid": (md.gratings.sinusoidal(1.6, 0.3), 2.0),
+        "crossed": (md.gratings.crossed(2.0, 0.3, samples=64), 1.5),
         "deep": (md.gratings.sinusoidal(3.0, 0.8), 3.0),
         "elaphe": (md.gratings.elaphe_synthetic(8), 1.5),
         "xenopeltis": (md.gratings.xenopeltis_synthetic(8), 2.0),
@@ -189,6 +197,7 @@ class RandomScene:
         if not nested:
             kinds += ["normalmap", "bumpmap", "blendbsdf", "twosided"]
             kinds += ["dielectric", "roughdielectric", "thindielectric", "mask", "null"] * transmits
+            kinds += ["principledthin", "hair"] * transmits
         kind, children, parameters = self.pick(*kinds), [], {}
         if kind == "diffuse":
             children = [self.colour("reflectance")] * self.chance(0.9)
@@ -199,6 +208,11 @@ class RandomScene:
         elif kind == "principled":
             children = [self.colour("base_color")]
             parameters = {"roughness": self.uniform(0.3, 0.8), "metallic": self.pick(0.0, 0.5), "clearcoat": 0.3}
+        elif kind == "principledthin":
+            children = [self.colour("base_color")]
+            parameters = {"roughness": self.uniform(0.3, 0.8), "spec_trans": 0.4, "diff_trans": 0.6}
+        elif kind == "hair":
+            parameters = {"longitudinal_roughness": 0.3, "eumelanin": self.uniform(0.1, 1.0)}
         elif kind == "normalmap":
             children = [self.tilted(), self.receiver(nested=True)]
         elif kind == "bumpmap":
@@ -223,12 +237,19 @@ class RandomScene:
         rotation = vector("rotate", axis).replace("/>", f' angle="{self.uniform(0, 60)}"/>')
         return to_world(vector("scale", scale), rotation, vector("translate", self.place(height)))
 
-    def bent_sheet(self):
-        """A mesh with UVs."""
+    def bent_sheet(self, kind):
+        """A mesh with UVs, as `ply` or `obj`."""
         u, v = np.meshgrid(*[np.linspace(0, 1, 6)] * 2)
         points = np.stack([2 * u - 1, 2 * v - 1, 0.3 * u * (1 - u)], -1)
         k = np.arange(36).reshape(6, 6)
         a, b, c, d = (part.ravel() for part in (k[:-1, :-1], k[:-1, 1:], k[1:, 1:], k[1:, :-1]))
+        if kind == "obj":
+            path = self.file("sheet.obj")
+            lines = ["v {} {} {}".format(*p) for p in points.reshape(-1, 3)]
+            lines += [f"vt {x} {y}" for x, y in zip(u.ravel(), v.ravel(), strict=True)]
+            lines += ["f {0}/{0} {1}/{1} {2}/{2} {3}/{3}".format(*f) for f in np.stack([a, b, c, d], -1) + 1]
+            path.write_text("\n".join(lines))
+            return path
         mesh = mi.Mesh("sheet", 36, 50, has_vertex_texcoords=True)
         params = mi.traverse(mesh)
         params["vertex_positions"] = np.float32(points).ravel()
@@ -244,20 +265,43 @@ class RandomScene:
         path.write_text("-1 0 0.5 0.15\n0 0 0.8 0.15\n0.5 0.5 0.6 0.15\n1 0.5 0.5 0.15\n1.5 0.7 0.5 0.15\n")
         return path
 
-    def shape(self, size, height, *children, kinds=("rectangle", "disk", "sphere", "cylinder", "cube", "ply")):
+    def distances(self):
+        """A bent ball, as distances to it on a grid."""
+        z, y, x = np.meshgrid(*[np.linspace(-1, 1, 10)] * 3, indexing="ij")
+        path = self.file("distances.vol")
+        mi.VolumeGrid(np.float32(np.sqrt(x * x + y * y + z * z) - 0.7 + 0.1 * x * y)[..., None]).write(str(path))
+        return path
+
+    def ellipsoids(self):
+        count, path = 4, self.file("ellipsoids.ply")
+        rotations = self.rng.normal(size=(count, 4))
+        rotations /= np.linalg.norm(rotations, axis=1)[:, None]
+        centres, normals = self.rng.uniform(-0.5, 0.5, (count, 3)), np.zeros((count, 3))
+        rows = np.hstack([centres, normals, self.rng.uniform(0.15, 0.4, (count, 3)), rotations])
+        names = ["x", "y", "z", "nx", "ny", "nz", "scale_0", "scale_1", "scale_2", "rot_0", "rot_1", "rot_2", "rot_3"]
+        header = ["ply", "format ascii 1.0", f"element vertex {count}", *(f"property float {name}" for name in names)]
+        path.write_text("\n".join([*header, "end_header", *(" ".join(map("{:.6f}".format, row)) for row in rows), ""]))
+        return path
+
+    def shape(self, size, height, *children, kinds=SHAPES):
         kind, parameters, placed = self.pick(*kinds), {}, [self.transform(size, height)]
         if self.chance(0.1):
             parameters["flip_normals"] = True
-        if kind == "ply":
-            parameters["filename"] = self.bent_sheet()
+        if kind in ("ply", "obj"):
+            parameters["filename"] = self.bent_sheet(kind)
         elif kind == "sphere":
             placed, parameters["radius"] = [vector("point", self.place(height), "center")], 0.7 * size
         elif kind == "cylinder":
             x, y, z = self.place(height)
             placed = [vector("point", [x - size, y, z], "p0"), vector("point", [x + size, y, z], "p1")]
             parameters["radius"] = 0.5 * size
-        elif kind == "bsplinecurve":
+        elif kind.endswith("curve"):
             placed, parameters = [], {"filename": self.curve()}
+        elif kind == "sdfgrid":
+            scale, moved = vector("scale", [1.5 * size] * 3), vector("translate", self.place(height))
+            placed, parameters = [to_world(scale, moved)], {"filename": self.distances()}
+        elif kind.startswith("ellipsoids"):
+            placed, parameters = [self.transform(1.2 * size, height)], {"filename": self.ellipsoids()}
         return plugin("shape", kind, *placed, *children, **parameters)
 
     def gratings(self):
@@ -270,8 +314,8 @@ class RandomScene:
                 found += group.replace("<shape ", f'<shape id="group{self.count}" ', 1)
                 found += plugin("shape", "instance", f'<ref id="group{self.count}"/>', self.transform(1.0, height))
             else:
-                kinds = {"kinds": ("bsplinecurve",)} if self.chance(0.1) else {}
-                found += self.shape(size, height, self.surface(), **kinds)
+                kinds = OTHER_SHAPES if self.chance(0.25) else SHAPES
+                found += self.shape(size, height, self.surface(), kinds=kinds)
         return found
 
     # ------------------------------------------------------------------ lights
@@ -291,7 +335,7 @@ class RandomScene:
                 facing = to_world(f'<scale value="{size}"/>', look)
                 return plugin("shape", self.pick("rectangle", "disk"), facing, emitter)
             bsdf = [self.receiver()] * self.chance(0.2)
-            kinds = ("sphere", "cylinder", "cube", "ply")
+            kinds = ("sphere", "cylinder", "cube", "ply", "ellipsoidsmesh")
             return self.shape(size, self.uniform(2.5, 4), *bsdf, emitter, kinds=kinds)
         if kind == "constant":
             return plugin("emitter", kind, self.colour("radiance", 0.3, varies=False), **of)
@@ -357,7 +401,8 @@ class RandomScene:
             wall = to_world('<rotate x="1" angle="90"/><scale value="4"/><translate y="1.5"/>')
             found += plugin("shape", "rectangle", wall, of_floor if self.chance(0.7) else self.receiver())
         if self.chance(0.4):
-            found += self.shape(self.uniform(0.2, 0.5), self.uniform(0.3, 1.5), self.receiver())
+            kinds = SHAPES + OTHER_SHAPES
+            found += self.shape(self.uniform(0.2, 0.5), self.uniform(0.3, 1.5), self.receiver(), kinds=kinds)
         return found
 
     def xml(self):
