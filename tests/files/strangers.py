@@ -219,6 +219,15 @@ FORMATS = {
     "jpk_archive": (".jpk-qi-data", lambda: foreign_scans.jpk(image="data-image.jpk-qi-image"), _INSTRUMENT),
     "park": (".tiff", foreign_scans.park, _INSTRUMENT),
     "nanoscope": (".spm", _nanoscope, _INSTRUMENT),
+    "mdt": (".mdt", foreign_scans.mdt, _INSTRUMENT),
+    "datx": (".datx", foreign_scans.datx, _INSTRUMENT),
+    "opd": (".opd", foreign_scans.opd, _INSTRUMENT),
+    "vk4": (".vk4", foreign_scans.vk4, _INSTRUMENT),
+    "vk6": (".vk6", lambda: foreign_scans.vk4(wrapped=True), _INSTRUMENT),
+    "zon": (".zon", foreign_scans.zon, _INSTRUMENT),
+    "zon_compressed": (".zon", lambda: foreign_scans.zon(compressed=True), _INSTRUMENT),
+    "sxm": (".sxm", foreign_scans.sxm, _INSTRUMENT),
+    "h5_jpk": (".h5-jpk", foreign_scans.h5_jpk, _INSTRUMENT),
     "recipe": (".toml", lambda: _PROFILE, lambda path: Recipe.load(path).check()),
     "recipe_of_scan": (".toml", lambda: _OF_SCAN, lambda path: Recipe.load(path).check()),
     "recipe_rigorous": (".toml", lambda: _RIGOROUS, lambda path: Recipe.load(path).check()),
@@ -307,7 +316,7 @@ def _packed(random_):
 
 def _inside(content):
     """A function that changes what checksums or compression hide, if there are any."""
-    if content.startswith(b"PK"):
+    if content.startswith((b"PK", b"VK6PK", b"KPK")):
         return lambda change, random_: _in_archive(content, change, random_)
     if content.startswith(b"\x89PNG"):
         return lambda change, random_: _in_png(content, change, random_)
@@ -322,6 +331,7 @@ def _in_archive(content, change, random_):
     name = random_.choice(list(members))
     members[name] = change(members[name])
     stream = io.BytesIO()
+    stream.write(content[: content.index(b"PK\3\4")])
     with zipfile.ZipFile(stream, "w", zipfile.ZIP_DEFLATED) as archive:
         for other, part in members.items():
             archive.writestr(other, part)
@@ -404,11 +414,21 @@ def _black(side=13000, kind="PNG"):
     return _saved(lambda stream: Image.new("L", (side, side)).save(stream, kind, compress_level=1))
 
 
-def _archive_of(main):
+def _archive_of(main, name="main.xml"):
     stream = io.BytesIO()
     with zipfile.ZipFile(stream, "w", zipfile.ZIP_DEFLATED, compresslevel=1) as archive:
-        archive.writestr("main.xml", main)
+        archive.writestr(name, main)
     return stream.getvalue()
+
+
+def _zon_of_zeros():
+    """Each row is followed by bytes that are not used, 1.3 GB in all."""
+
+    def change(members):
+        name = next(name for name in members if name.startswith("4cdb0c75"))
+        members[name] = struct.pack("<4i", 24, 16, 4, 8 * 10**7) + bytes(16 * 8 * 10**7)
+
+    return foreign_scans.zon(True, change)
 
 
 def _lying_archive():
@@ -468,6 +488,48 @@ def _with_pages(count, tags):
     return content[:next_page] + struct.pack("<I", offsets[0]) + content[next_page + 4 :] + pages
 
 
+def _h5_jpk(change):
+    """A file of JPK in HDF5 without its heights, in which `change(group)` puts others."""
+    import h5py
+
+    whole = io.BytesIO(foreign_scans.h5_jpk())
+    with h5py.File(whole, "a") as file:
+        group = file["Measurement_000/Channel_002"]
+        del group["Height"]
+        change(group)
+    return whole.getvalue()
+
+
+def _linked(group):
+    import h5py
+
+    group["Height"] = h5py.ExternalLink("linked_heights.h5-jpk", "/Measurement_000/Channel_001/Height")
+
+
+def _datx(deep=False):
+    """A file of Zygo: 8,000 groups in each other, or a table of 400 texts that are one and the same, of 4 MB."""
+    import h5py
+
+    whole = io.BytesIO(foreign_scans.datx())
+    with h5py.File(whole, "a") as file:
+        if deep:
+            group = file.create_group("Attributes")
+            for _ in range(8_000):
+                group = group.create_group("a")
+        else:
+            kind = file["MetaData"].dtype
+            rows = [*file["MetaData"], *((b"x", b"%d" % k, b"y") for k in range(400)), (b"x", b"y", 2**22 * b"x")]
+            del file["MetaData"]
+            table = file.create_dataset("MetaData", data=np.array(rows, kind))
+            at, size = table.id.get_offset(), 48  # of three references
+    content = bytearray(whole.getvalue())
+    if not deep:
+        for row in range(3, 403):
+            end = at + (row + 1) * size
+            content[end - 16 : end] = content[at + 403 * size + size - 16 : at + 404 * size]
+    return bytes(content)
+
+
 def _aliases():
     lists = "".join(f"a{i}: &a{i} [{', '.join(8 * [f'*a{i - 1}' if i else '1'])}]\n" for i in range(8))
     return f"{lists}DATA:\n  - type: formula 1\n    wavelength_range: 0.3 2\n    coefficients: *a7\n".encode()
@@ -496,7 +558,7 @@ CRAFTED = {
     "large_powers": (".exr", lambda: _with(lambda values: values + np.float32(1e30)), load_spectrum),
     "long_source": (".exr", lambda: _with(source="x" * 3_000_000), load_spectrum),
 }
-# The same, of files that take seconds to make.
+# The same, of files that take seconds to make, or need the extra.
 SLOWLY_CRAFTED = {
     "many_pages": (".jpk", lambda: _with_pages(200, 4000), _INSTRUMENT),
     "npz_of_zeros": (".npz", _npz_of_zeros, _MICROMETRES),
@@ -505,6 +567,20 @@ SLOWLY_CRAFTED = {
     "elements": (".x3p", lambda: _archive_of(b"<a>" + 3_000_000 * b"<b/>" + b"</a>"), _INSTRUMENT),
     "nested_elements": (".x3p", lambda: _archive_of(50_000 * b"<a>" + 50_000 * b"</a>"), _INSTRUMENT),
     "many_elements": (".x3p", lambda: _archive_of(b"<a>" + 15_000_000 * b"<b/>" + b"</a>"), _INSTRUMENT),
+    "heights_of_a_device": (
+        ".h5-jpk",
+        lambda: _h5_jpk(lambda g: g.create_dataset("Height", (384, 1), "i4", external=[("/dev/zero", 0, 1536)])),
+        _INSTRUMENT,
+    ),
+    "linked_heights": (".h5-jpk", lambda: _h5_jpk(_linked), _INSTRUMENT),
+    "long_texts": (".datx", _datx, _INSTRUMENT),
+    "deep_groups": (".datx", lambda: _datx(deep=True), _INSTRUMENT),
+    "elements_of_another": (
+        ".plux",
+        lambda: _archive_of(b"<a>" + 15_000_000 * b"<b/>" + b"</a>", "index.xml"),
+        _INSTRUMENT,
+    ),
+    "zstandard": (".zon", _zon_of_zeros, _INSTRUMENT),
     "lying_archive": (".x3p", _lying_archive, _INSTRUMENT),
     "lying_archive_of_another": (".plux", _lying_archive, _INSTRUMENT),
     "black_spectral_image": (".exr", _black_exr, _read_spectral_image),
@@ -523,7 +599,7 @@ LARGE = {
 
 def fault(read, path, refused=None):
     """What is wrong with how a file is read or refused, or ""; `refused`: which of the two it must be, if either."""
-    start, found, was_refused = time.process_time(), "", False
+    start, found, was_refused, before = time.process_time(), "", False, _peak()
     try:
         read(path)
     except MemoryError:
@@ -532,12 +608,16 @@ def fault(read, path, refused=None):
         was_refused = True
         if is_bug(type(error)):
             found = f"a bug: {type(error).__name__}: {str(error)[:200]}"
-        elif "\n" in str(error) or "Unable to allocate" in str(error):
+        elif re.search("MemoryError|Unable to allocate", str(error)):
+            found = f"more than 1 GB: {str(error)[:200]!r}"
+        elif "\n" in str(error):
             found = f"not refused in one line: {str(error)[:200]!r}"
         elif refused is False:
             found = f"refused: {str(error)[:200]}"
     if refused and not was_refused:
         found += " read"
+    if before < (peak := _peak()) > MAX_BYTES:  # what a library catches is not raised
+        found += f" {peak / 1e9:.2f} GB"
     if (seconds := time.process_time() - start) > MAX_SECONDS:
         found += f" {seconds:.1f} s"
     return found
@@ -564,11 +644,26 @@ def faults_of_mutants(name, count, folder, seed=0):
             yield number, found
 
 
-def _limit_memory():
+_in_memory_at_first = None  # bytes; None: not counted
+
+
+def _peak():
+    """The most bytes in memory so far beside those at first."""
+    if _in_memory_at_first is None:
+        return 0
     import resource
 
-    used = int(Path("/proc/self/statm").read_text().split()[0]) * resource.getpagesize()
-    resource.setrlimit(resource.RLIMIT_AS, (used + MAX_BYTES, resource.RLIM_INFINITY))
+    return 1024 * resource.getrusage(resource.RUSAGE_SELF).ru_maxrss - _in_memory_at_first
+
+
+def _limit_memory():
+    """Count the memory from now on; twice `MAX_BYTES` of addresses, so that what is too much can be counted."""
+    import resource
+
+    global _in_memory_at_first
+    pages = [int(count) * resource.getpagesize() for count in Path("/proc/self/statm").read_text().split()]
+    _in_memory_at_first = pages[1]
+    resource.setrlimit(resource.RLIMIT_AS, (pages[0] + 2 * MAX_BYTES, resource.RLIM_INFINITY))
 
 
 def _in_this_process(names):

@@ -10,17 +10,8 @@ from test_instrument_files import needs_the_extra
 
 MUTANTS = 2000
 _OF_THE_EXTRA = (
-    "x3p",
-    "x3p_text",
-    "sur",
-    "tmd",
-    "nms",
-    "ibw",
-    "jpk",
-    "jpk_archive",
-    "park",
-    "nanoscope",
-    "nanoscope_text",
+    *("x3p", "x3p_text", "sur", "tmd", "nms", "ibw", "jpk", "jpk_archive", "park", "nanoscope", "nanoscope_text"),
+    *("mdt", "datx", "opd", "vk4", "vk6", "zon", "zon_compressed", "h5_jpk"),
 )
 _SLOW_TO_MAKE = ("spectrum_rigorous", "spectrum_of_sample")
 

@@ -244,6 +244,113 @@ probe: 5 µm
     return header.encode("latin-1") + b"\x1a\x04" + data.tobytes()
 
 
+def mdt():
+    """NT-MDT: one frame of int16, upwards, with the scales of x, y (µm) and heights (nm)."""
+    numbers = np.rint(relief()[::-1] * 1e4).astype("<i2")  # tenths of a nanometre
+    scales = struct.pack("<ffhffhffh", 0, DX, -2, 0, DY, -2, 0, 0.1, -1)
+    variables = scales + struct.pack("<BBHH", 0, 0, COLUMNS, ROWS)
+    body = variables + struct.pack("<4H", 0, COLUMNS, ROWS, 0) + numbers.tobytes()
+    date = 2026, 11, 29, 12, 0, 0
+    frame = struct.pack("<IH", 22 + len(body), 0) + struct.pack(">H", 1) + struct.pack("<7H", *date, len(variables))
+    return struct.pack("<II4xH19x", 0xFF93B001, len(frame) + len(body), 0) + frame + body
+
+
+def datx():
+    """Zygo's HDF5: a table of texts names the data set, whose attributes have its scales; downwards, in nm."""
+    import h5py
+
+    text = h5py.string_dtype("ascii")
+    entries = [
+        ("Root", "Measurement", "{1}"),
+        ("{1}", "Surface", "{2}"),
+        ("{2}", "Path", "/Data/Surface/{3}"),
+    ]
+    converter = np.dtype([("Category", text), ("BaseUnit", text), ("Parameters", h5py.vlen_dtype(np.float64))])
+    whole = io.BytesIO()
+    with h5py.File(whole, "w") as file:
+        table = np.dtype([("Source", text), ("Link", text), ("Destination", text)])
+        file["MetaData"] = np.array([tuple(word.encode() for word in entry) for entry in entries], table)
+        surface = file.create_dataset("/Data/Surface/{3}", data=relief() * 1000)
+        surface.attrs["Unit"] = np.array([b"NanoMeters"], object).astype(text)
+        surface.attrs["No Data"] = np.array([1e308])
+        steps = (
+            ("X", "LateralCat", "Pixels", DX),
+            ("Y", "LateralCat", "Pixels", DY),
+            ("Z", "HeightCat", "NanoMeters", 1),
+        )
+        for axis, category, unit, step in steps:
+            value = np.empty(1, converter)
+            value[0] = category.encode(), unit.encode(), np.array([0.0, step * 1e-6, 0.0, 0.0])
+            surface.attrs.create(f"{axis} Converter", value, dtype=converter)
+    return whole.getvalue()
+
+
+def opd():
+    """Wyko OPD: a directory of blocks; a column after the other, upwards, in units of Wavelength / Mult, nm."""
+    numbers = np.ascontiguousarray(relief()[::-1].T * 1000 / (600 / 2), "<f4")
+    raw = struct.pack("<3H", COLUMNS, ROWS, 4) + numbers.tobytes()
+    blocks = [
+        ("Wavelength", 7, struct.pack("<f", 600)),
+        ("Mult", 6, struct.pack("<h", 2)),
+        ("Aspect", 7, struct.pack("<f", DY / DX)),
+        ("Pixel_size", 7, struct.pack("<f", DX / 1000)),
+        ("Title", 5, b"A relief".ljust(20, b"\0")),
+        ("RAW_DATA", 3, raw),
+    ]
+
+    def entry(name, kind, length):
+        return struct.pack("<16shiH", name.encode(), kind, length, 0)
+
+    directory = entry("Directory", 1, 24 * (len(blocks) + 1))
+    directory += b"".join(entry(name, kind, len(content)) for name, kind, content in blocks)
+    return b"\1\0" + directory + b"".join(content for _, _, content in blocks)
+
+
+def vk4(wrapped=False):
+    """Keyence VK4: a table of offsets, settings, and an image of uint32, downwards, in pm; `wrapped` as VK6, zipped."""
+    names = 80 * [0]
+    names[:8] = 320, 2026, 11, 29, 12, 0, 0, 60
+    names[42], names[43], names[44] = round(DX * 1e6), round(DY * 1e6), 100  # pm of a pixel, and of a step of heights
+    offsets = 18 * [0]
+    offsets[6] = 12 + 4 * (len(offsets) + len(names))
+    numbers = np.rint(relief() * 1e4).astype("<u4")
+    image = struct.pack("<7I", COLUMNS, ROWS, 32, 0, numbers.nbytes, 0, 2**32 - 1) + bytes(768) + numbers.tobytes()
+    whole = b"VK4_" + bytes(8) + struct.pack("<98I", *offsets, *names) + image
+    if not wrapped:
+        return whole
+    archive = io.BytesIO()
+    with zipfile.ZipFile(archive, "w", zipfile.ZIP_DEFLATED) as written:
+        written.writestr("Vk4File", whole)
+    return b"VK6" + archive.getvalue()
+
+
+def zon(compressed=False, changes=lambda members: None):
+    """Keyence ZON: a ZIP after a thumbnail; its members, of UUIDs, have settings, heights in nm and what is invalid.
+
+    Pixels are square, and each member may be compressed by zstandard. `changes` may replace members.
+    """
+    numbers = np.rint(relief() * 1000).astype("<i4")
+    members = {
+        "cbc1d39b-215f-4d56-a20e-cf8e5f570755": b"<Device><DeviceModelName>VR</DeviceModelName>"
+        b"<DeviceSerialId>1</DeviceSerialId></Device>",
+        "1d35862b-3b48-4df2-9235-833ef590b043": b"<Scan><ScanDateTime>2026-11-29T12:00:00</ScanDateTime></Scan>",
+        "686613b8-27b5-4a29-8ffc-438c2780873e": f"<Unit><XYCalibration><MeterPerPixel>{DX * 1e-6}</MeterPerPixel>"
+        "</XYCalibration><ZCalibration><MeterPerUnit>1e-9</MeterPerUnit></ZCalibration></Unit>".encode(),
+        "4cdb0c75-5706-48cc-a9a1-adf395d609ae": struct.pack("<4i", COLUMNS, ROWS, 4, 4 * COLUMNS) + numbers.tobytes(),
+        "9e7ca6dd-0e6a-4d7b-8986-f0a7b773c916": struct.pack("<4i", COLUMNS, ROWS, 1, COLUMNS) + bytes(ROWS * COLUMNS),
+    }
+    changes(members)
+    if compressed:
+        import zstandard
+
+        members = {name: zstandard.compress(content) for name, content in members.items()}
+    whole = io.BytesIO()
+    with zipfile.ZipFile(whole, "w") as archive:
+        for name, content in members.items():
+            archive.writestr(name, content)
+    return (b"KPK1" if compressed else b"KPK0") + struct.pack("<I", 6) + b"a BMP " + whole.getvalue()
+
+
 def h5_jpk(reflect=False, frames=2, multiplier=-1e-13, pixels=ROWS * COLUMNS):
     """JPK in HDF5: matrices of pixels by frames, of which the first has the relief; retrace before trace."""
     import h5py

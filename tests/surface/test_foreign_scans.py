@@ -7,7 +7,29 @@ from contextlib import nullcontext
 import foreign_scans
 import numpy as np
 import pytest
-from foreign_scans import COLUMNS, DX, DY, REVISION, ROWS, h5_jpk, ibw, jpk, nms, park, sur, sxm, tmd, wyko, x3p, zygo
+from foreign_scans import (
+    COLUMNS,
+    DX,
+    DY,
+    REVISION,
+    ROWS,
+    datx,
+    h5_jpk,
+    ibw,
+    jpk,
+    mdt,
+    nms,
+    opd,
+    park,
+    sur,
+    sxm,
+    tmd,
+    vk4,
+    wyko,
+    x3p,
+    zon,
+    zygo,
+)
 from test_instrument_files import needs_the_extra
 
 from mitsuba_diffraction.files import reading
@@ -40,6 +62,11 @@ INSTRUMENTS = {
     "curves.jpk-qi-data": (jpk, {"image": "data-image.jpk-qi-image"}),
     "curves.zip": (jpk, {"image": "data-image.jpk-qi-image"}),
     "curves.jpk-force-map": (jpk, {"image": "data-image.force"}),
+    "scan.mdt": (mdt, {}),
+    "scan.datx": (datx, {}),
+    "scan.opd": (opd, {}),
+    "scan.vk4": (vk4, {}),
+    "scan.vk6": (vk4, {"wrapped": True}),
 }
 INTERFEROMETERS = {
     "scan.asc": (wyko, {"missing": MISSING}),
@@ -419,6 +446,70 @@ def test_jpk_in_hdf5_is_read(tmp_path):
     path.write_bytes(h5_jpk()[:3000])
     with pytest.raises(ValueError, match="a damaged file of JPK, or not one") as caught:
         read_height_field(path)
+    assert "\n" not in str(caught.value)
+
+
+def _virtual(group, shape):
+    import h5py
+
+    layout = h5py.VirtualLayout(shape, "i4")
+    layout[...] = h5py.VirtualSource("other.h5", "heights", shape)
+    group.create_virtual_dataset("Height", layout)
+
+
+def _nested(group, shape):
+    import h5py
+
+    group.create_dataset("Height", shape, "i4")
+    kind = h5py.h5t.py_create(h5py.vlen_dtype(h5py.string_dtype()), logical=True)
+    h5py.h5a.create(group.id, b"a", kind, h5py.h5s.create_simple((1,)))
+
+
+@needs_the_extra
+@pytest.mark.parametrize("compressed", [False, True])
+def test_an_archive_after_a_thumbnail_is_read(compressed, tmp_path):
+    (tmp_path / "scan.zon").write_bytes(zon(compressed))
+    field = read_height_field(tmp_path / "scan.zon")
+    assert field.pixel_size == pytest.approx((DX, DX))
+    np.testing.assert_allclose(field.heights, foreign_scans.relief(), atol=1e-3)
+    if compressed:
+        (tmp_path / "scan.zon").write_bytes(zon(compressed).replace(b"\x28\xb5\x2f\xfd", b"none"))
+        with pytest.raises(ValueError, match="a damaged archive"):
+            read_height_field(tmp_path / "scan.zon")
+
+
+# How heights stand in the file → why they are refused.
+STRANGE_HDF5 = {
+    "chunk": (
+        lambda group, shape: group.create_dataset(
+            "Height", shape, "i4", chunks=(shape[0], 10**6), maxshape=(384, None)
+        ),
+        "got 384 × 1000000 numbers in .* kB",
+    ),
+    "virtual": (_virtual, "numbers are in another file"),
+    "device": (
+        lambda group, shape: group.create_dataset("Height", shape, "i4", external=[("/dev/zero", 0, 1536)]),
+        "numbers are in another file",
+    ),
+    "arrays_in_arrays": (_nested, "arrays of variable length in others"),
+}
+
+
+@needs_the_extra
+@pytest.mark.parametrize("name", STRANGE_HDF5)
+def test_hdf5_that_expands_or_names_other_files_is_refused(name, tmp_path):
+    import h5py
+
+    (tmp_path / "scan.h5-jpk").write_bytes(h5_jpk())
+    with h5py.File(tmp_path / "other.h5", "w") as file:
+        file["heights"] = np.arange(ROWS * COLUMNS, dtype="i4")[:, None]
+    with h5py.File(tmp_path / "scan.h5-jpk", "a") as file:
+        group = file["Measurement_000/Channel_002"]
+        del group["Height"]
+        change, message = STRANGE_HDF5[name]
+        change(group, (ROWS * COLUMNS, 1))
+    with pytest.raises(ValueError, match=message) as caught:
+        read_height_field(tmp_path / "scan.h5-jpk")
     assert "\n" not in str(caught.value)
 
 

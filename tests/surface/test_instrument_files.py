@@ -16,9 +16,10 @@ from mitsuba_diffraction.surface import prepare
 from mitsuba_diffraction.surface.heightfield import HeightField
 from mitsuba_diffraction.surface.periods import find_periods
 from mitsuba_diffraction.surface.readers import instruments, read_height_field
+from mitsuba_diffraction.surface.readers.scan import EXTRA
 
 needs_the_extra = pytest.mark.skipif(
-    importlib.util.find_spec("SurfaceTopography") is None, reason=f"SurfaceTopography is missing: {instruments.EXTRA}"
+    importlib.util.find_spec("SurfaceTopography") is None, reason=f"SurfaceTopography is missing: {EXTRA}"
 )
 
 PITCH = 0.3143

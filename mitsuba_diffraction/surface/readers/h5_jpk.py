@@ -14,8 +14,7 @@ import numpy as np
 
 from ...errors import RequestError
 from ...files.reading import check_array
-from . import scan
-from .instruments import EXTRA
+from . import hdf5, scan
 from .scan import Channel, Scan, choose_channel
 
 if TYPE_CHECKING:
@@ -27,11 +26,7 @@ _GRID, _SCALING = "position-pattern.grid", "net-encoder.scaling"
 def read_h5_jpk(path: Path, unit: str | tuple[str, str] | None, channel: str | int | None) -> Scan:
     """Read the first frame of one channel; the top row of its image is row 0."""
     try:
-        import h5py
-    except ImportError as error:
-        raise RequestError(f"an instrument's own format: wanted h5py, {EXTRA} ({error})") from None
-    try:
-        with h5py.File(path, "r") as file:
+        with hdf5.opened(path) as file:
             return _scan(file["Measurement_000"], unit, channel, path.stat().st_size)
     except RequestError:
         raise

@@ -15,12 +15,10 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from ...errors import RequestError, pip_install
+from ...errors import RequestError
 from ...files.reading import check_array
-from . import scan, workarounds
-from .scan import Channel, Scan, choose_channel
-
-EXTRA = pip_install("instruments")
+from . import hdf5, scan, workarounds
+from .scan import EXTRA, Channel, Scan, choose_channel
 
 # Formats that SurfaceTopography names by their extension, and others.
 _NAMED_ALIKE = (
@@ -61,6 +59,9 @@ def read_instrument(path: Path, unit: str | tuple[str, str] | None, channel: str
         library = lookup_reader_by_format[name]
         contents, doubts, has_unit_of_heights = workarounds.rewritten(path, name)
         try:
+            if name == "datx":
+                with hdf5.opened(path):
+                    pass  # is checked
             found = {c.index: c for c in library(contents).channels}
             chosen = choose_channel(
                 [

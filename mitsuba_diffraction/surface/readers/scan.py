@@ -8,8 +8,10 @@ from dataclasses import dataclass
 
 from numpy.typing import NDArray
 
-from ...errors import RequestError
+from ...errors import RequestError, pip_install
 from ...settings import Settings
+
+EXTRA = pip_install("instruments")
 
 # What a scan that diffracts light can be, µm; outside, a unit is wrong.
 MIN_HEIGHT_RANGE, MAX_HEIGHT_RANGE = 2e-4, Settings.largest_height_range

@@ -46,6 +46,8 @@ _IBW_HEADER = 384
 _IBW_LABELS, _IBW_DIMENSIONS, _IBW_UNIT = 36, 132, 212  # offsets of four int32, of four int32, of a text
 _TIFF = "jpk", "ps", "lext"
 _JPK_GRID = ("ScanWidth", "ScanLength")  # pixels, by the library's names
+_ZON, _ZON_COMPRESSED = b"KPK0", b"KPK1"  # first bytes of a .zon
+_ZSTD_BLOCK, _XML_START = 2**22, 64  # bytes
 _JPK_IMAGES = ("data-image.jpk-qi-image", "data-image.force")
 
 
@@ -100,17 +102,51 @@ def _opened(path: Path) -> zipfile.ZipFile:
 
 
 def _archive(path: Path) -> io.BytesIO:
-    """Return an archive whose members are as long as they are declared."""
+    """Return an archive whose members are as long as they are declared, after what precedes them in the file.
+
+    Their XML has the limits of `parse_xml`.
+    """
+    data = read_bytes(path)
     with _opened(path) as archive:
-        return _packed(unpacked_members(archive, archive.namelist(), path.stat().st_size))
+        start = min((member.header_offset for member in archive.infolist()), default=0)
+        members = unpacked_members(archive, archive.namelist(), len(data))
+    before = data[:start]
+    if before.startswith(_ZON_COMPRESSED):
+        before = _ZON + before[len(_ZON) :]
+        members = _decompressed(members, len(data))
+    for content in members.values():
+        if b"<" in content[:_XML_START]:
+            with suppress(ElementTree.ParseError):  # what is no XML is refused by the library, if it reads it
+                parse_xml(content)
+    return _packed(members, before)
 
 
-def _packed(members: Mapping[str, bytes]) -> io.BytesIO:
-    """Return an archive, without compression."""
+def _decompressed(members: Mapping[str, bytes], stored: int) -> dict[str, bytes]:
+    """Return members of a .zon that are compressed by zstandard, which SurfaceTopography requires."""
+    import zstandard
+
+    found, count = dict[str, bytes](), 0
+    for name, content in members.items():
+        blocks = []
+        try:
+            with zstandard.ZstdDecompressor().stream_reader(content) as stream:
+                while block := stream.read(_ZSTD_BLOCK):
+                    check_unpacked(count := count + len(block), stored)
+                    blocks.append(block)
+        except zstandard.ZstdError as error:
+            raise RequestError(f"a damaged archive ({error})") from None
+        found[name] = b"".join(blocks)
+    return found
+
+
+def _packed(members: Mapping[str, bytes], before: bytes = b"") -> io.BytesIO:
+    """Return an archive, without compression, after other bytes."""
     whole = io.BytesIO()
+    whole.write(before)
     with zipfile.ZipFile(whole, "w") as written:
         for name, content in members.items():
             written.writestr(name, content)
+    whole.seek(0)
     return whole
 
 
