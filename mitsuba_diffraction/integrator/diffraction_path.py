@@ -11,7 +11,8 @@ from ..bsdf.base import nested_plugin
 from ..bsdf.light import is_black, recorded_wavelengths
 from ..errors import RequestError
 from ..parameter_documentation import Parameter, listed
-from .paths import Gratings, LightPaths, define_eye_paths, implements, unpacked
+from .eye_paths import EyeTracer, define_eye_paths
+from .paths import Gratings, LightPaths, implements, unpacked
 from .scene_cache import SceneCache
 
 PARAMETERS = (
@@ -91,7 +92,7 @@ def define() -> type:
             gratings = _lit_gratings(scene, sensor, self.max_depth, cache)
             if gratings is None:
                 return self.path, None
-            eye = eye_class(scene, sensor, gratings, cache, self.max_depth, self.rr_depth)
+            eye = eye_class(EyeTracer(scene, sensor, gratings, cache, self.max_depth, self.rr_depth))
             if 0 <= self.max_depth < 3 or not gratings.shapes:
                 return (eye if eye.candidates.any or eye.lamps.any else self.path), None
             recorded = recorded_wavelengths(sensor.film())
@@ -123,13 +124,9 @@ def define() -> type:
             if isinstance(sensor, int):
                 sensor = scene.sensors()[sensor]
             eye, light = self.parts(scene, sensor)
-            if hasattr(eye, "trace") and eye.lamps.any:
-                spp = _trace_eye_paths(scene, sensor, eye, seed, spp)
-            else:
-                if light is None:
-                    return eye.render(scene, sensor, seed, spp, develop, evaluate)
-                eye.render(scene, sensor, seed, spp, False, evaluate)
-                spp = sensor.sampler().sample_count()
+            if eye is self.path:
+                return eye.render(scene, sensor, seed, spp, develop, evaluate)
+            spp = _trace_eye_paths(scene, sensor, eye, seed, spp)
             if light is not None:
                 _add_light_paths(sensor, light, seed, spp)
             return sensor.film().develop() if develop else mi.TensorXf()
@@ -183,17 +180,20 @@ def _lit_gratings(scene: mi.Scene, sensor: mi.Sensor, max_depth: int, cache: Sce
 
 
 def _trace_eye_paths(scene: mi.Scene, sensor: mi.Sensor, eye: Any, seed: mi.UInt32 | int, spp: int) -> int:
-    """Put paths from the eye into the film of a sensor at wavelengths of their own; return the samples per pixel."""
+    """Put paths from the eye into the film of a sensor; return the samples per pixel."""
     # Mitsuba's rays, samplers and films of integrators in Python.
     camera = nested_plugin("prb")
     sampler, spp = camera.prepare(sensor, seed, spp)
     ray, weight, position = camera.sample_rays(scene, sensor, sampler)
-    (of_ray, of_lamps), valid = eye.trace(scene, sampler, ray, weight)
+    received, valid = eye.trace(scene, sampler, ray, weight)
     block = sensor.film().create_block()
     block.set_coalesce(block.coalesce() and spp >= 4)
-    alpha = dr.select(valid, mi.Float(1), 0)
-    for (wavelengths, value), opacity, weight_of_film in ((of_ray, alpha, 1.0), (of_lamps, 0.0, 0.0)):
+    opacity = dr.select(valid, mi.Float(1), 0)
+    weight_of_film = 1.0
+    for wavelengths, value in received:
         _put(sensor.film(), block, position, wavelengths, value, opacity, weight_of_film)
+        # Further light is at the same sample.
+        opacity = weight_of_film = 0.0
     sensor.film().put_block(block)
     return spp
 

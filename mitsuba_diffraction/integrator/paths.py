@@ -1,4 +1,4 @@
-"""Paths from the eye and paths from the light, the shapes that are gratings, and splats on the film.
+"""Paths from the light, the shapes that are gratings, and splats on the film; `eye_paths.py` has the other paths.
 
 The manual of `diffraction_path` lists which paths are traced from which end.
 """
@@ -16,8 +16,6 @@ from numpy.typing import NDArray
 
 from ..bsdf.base import gratings_in, is_grating, parts
 from ..bsdf.device_tables import on_device
-from .candidates import Candidates, MetEmitters
-from .lamps_without_extent import LampsWithoutExtent
 from .scene_cache import SceneCache
 
 
@@ -197,179 +195,8 @@ def _holds_gratings_only(bsdf: mi.BSDF) -> bool:
 
 
 _WITH_GRATINGS, _GRATING_ONLY, _INSTANCED, _MIXTURE = range(1, 5)  # kinds of shapes
-_GRATING_PROBABILITY = 0.5  # of a direction to a point on a grating
-_VISIBILITY_TOLERANCE = 1e-3  # relative, of the distance to that point
 _DRAWN_POINTS, _MIN_FOUND = 1024, 0.995  # on a shape, and the fraction of them that rays find
 _DENSITY_TOLERANCE = 5e-3  # relative, of the density of a sample and that of its direction, more than by rounding
-
-
-def define_eye_paths() -> type:
-    """Define the class for the current variant, as its base class depends on the variant."""
-
-    class EyePaths(mi.SamplingIntegrator):
-        """Mitsuba's `path` without the paths that are traced from the light (see `diffraction_path`)."""
-
-        def __init__(
-            self,
-            scene: mi.Scene,
-            sensor: mi.Sensor,
-            gratings: Gratings,
-            cache: SceneCache,
-            max_depth: int,
-            rr_depth: int,
-        ) -> None:
-            mi.SamplingIntegrator.__init__(self, mi.Properties("eye_paths"))
-            self.gratings = gratings
-            self.emitters = MetEmitters(scene)
-            self.candidates = Candidates(scene, self.emitters, gratings.shapes, gratings.instanced, cache)
-            self.lamps = LampsWithoutExtent(scene, sensor, cache)
-            # Whether L G X G E and L G X M E are short enough: a literal, which removes what serves them alone.
-            self.guides = bool(gratings.shapes) and not 0 <= max_depth < 4
-            # Opaque, so that all depths run the same kernel.
-            self.max_depth = dr.opaque(mi.UInt32, max_depth % 2**32)
-            self.rr_depth = dr.opaque(mi.UInt32, rr_depth)
-
-        def sample(
-            self,
-            scene: mi.Scene,
-            sampler: mi.Sampler,
-            ray: mi.RayDifferential3f,
-            medium: mi.Medium | None = None,
-            active: mi.Bool = True,
-        ) -> tuple[mi.Spectrum, mi.Bool, list[mi.Float]]:
-            # All light at the wavelengths of the ray.
-            with loops_traced_once():
-                ((_, radiance),), valid = self._trace(scene, sampler, ray, mi.Spectrum(1), active, False)
-            return radiance, valid, []
-
-        def trace(
-            self, scene: mi.Scene, sampler: mi.Sampler, ray: mi.RayDifferential3f, weight: mi.Spectrum
-        ) -> tuple[list[tuple[mi.Spectrum, mi.Spectrum]], mi.Bool]:
-            """Return four wavelengths in nm and radiance times the weight of the sensor there, and validity.
-
-            If there are lamps without extent, a second pair has their light at the first vertex.
-            """
-            with loops_traced_once():
-                return self._trace(scene, sampler, ray, weight, True, self.lamps.any)
-
-        @dr.syntax
-        def _trace(
-            self,
-            scene: mi.Scene,
-            sampler: mi.Sampler,
-            ray: mi.RayDifferential3f,
-            response: mi.Spectrum,
-            active: mi.Bool,
-            draws_wavelengths: bool,
-        ) -> tuple[list[tuple[mi.Spectrum, mi.Spectrum]], mi.Bool]:
-            ctx = mi.BSDFContext()
-            si = scene.ray_intersect(ray, active)
-            # Alpha is the same as in `path`: null interactions are transparent, an environment is not.
-            valid = mi.Bool(scene.environment() is not None)
-            result = self.emitters.at(si).eval(si, active)
-            ray_wavelengths = mi.Spectrum(ray.wavelengths)
-            throughput, eta = mi.Spectrum(1.0), mi.Float(1.0)
-            depth = mi.UInt32(1)
-            active = active & si.is_valid() & (depth < self.max_depth)
-            if dr.hint(draws_wavelengths, mode="scalar"):
-                first_on_grating = self.gratings.contains(si, active)
-                of_lamps = self.lamps.light(scene, sampler, si, first_on_grating)
-            # Whether an earlier vertex is not on a grating; whether the first vertex is on one or scatters specularly;
-            # whether an earlier vertex does not.
-            has_other_vertex, from_eye_only, has_scattered = mi.Bool(False), mi.Bool(False), mi.Bool(False)
-            widen(si)
-            while dr.hint(active, exclude=[self, scene, ctx]):
-                bsdf = si.bsdf()
-                on_grating, grating_only = self.gratings.classify(si, active)
-                si_bsdf = with_surviving_wavelengths(si, throughput, grating_only)
-                from_light = on_grating & has_other_vertex & (from_eye_only ^ True)
-                # In L G X G E, few directions from X that the BSDF samples lead to the first G.
-                to_gratings = (
-                    mi.Bool(self.guides) & active & from_eye_only & (on_grating ^ True) & _is_smooth_reflector(bsdf)
-                )
-                bsdf_probability = dr.select(to_gratings, 1 - _GRATING_PROBABILITY, 1)
-
-                # Emitter sampling
-                samples_emitter = active & mi.has_flag(bsdf.flags(), mi.BSDFFlags.Smooth)
-                point = sampler.next_2d(active)
-                samples_emitter &= from_light ^ True
-                # That of the emitters of which one is drawn.
-                probability = mi.Float(1)
-                if dr.hint(draws_wavelengths, mode="scalar"):
-                    point, probability, has_other = self.lamps.others(point, first_on_grating & (depth == 1))
-                    samples_emitter &= has_other
-                ds, emitted = scene.sample_emitter_direction(si, point, True, samples_emitter)
-                ds.pdf /= probability
-                emitted *= probability
-                wo = si.to_local(ds.d)
-                value, pdf = bsdf.eval_pdf(ctx, si_bsdf, wo, samples_emitter & (ds.pdf != 0))
-                slots, candidates = self.candidates.numbers(si, has_scattered, samples_emitter)
-                mis_weight = _power_heuristic(ds.pdf, bsdf_probability * pdf)
-                of_candidates = mi.Float(slots * candidates) * pdf
-                mis_weight = dr.select(slots > 0, quotient(ds.pdf, ds.pdf + of_candidates), mis_weight)
-                mis_weight = dr.select(ds.delta, 1, mis_weight)
-                result += dr.select(samples_emitter & (ds.pdf != 0), throughput * value * emitted * mis_weight, 0)
-                if dr.hint(self.candidates.any, mode="scalar"):
-                    light = self.candidates.sample(scene, sampler, si_bsdf, (slots, candidates), probability, slots > 0)
-                    result += dr.select(slots > 0, throughput * light, 0)
-
-                # BSDF sampling, or the direction to a point on a grating; the next ray may hit an emitter.
-                guided = to_gratings & (sampler.next_1d(active) < _GRATING_PROBABILITY)
-                ps = self.gratings.sample(si.time, sampler.next_1d(active), sampler.next_2d(active), guided)
-                to_point = si.spawn_ray_to(ps.p)
-                distance = dr.norm(ps.p - to_point.o)
-                value, pdf = bsdf.eval_pdf(ctx, si_bsdf, si.to_local(to_point.d), guided)
-                # The last vertex of a path has no other light to find than that of candidates, but for specular light.
-                is_last = (slots > 0) & (depth + 1 >= self.max_depth)
-                has_ended = active & is_last & ~mi.has_flag(bsdf.flags(), mi.BSDFFlags.Delta)
-                valid |= has_ended
-                active &= ~has_ended
-                unguided = active & (guided ^ True)
-                bs, weight = bsdf.sample(ctx, si_bsdf, sampler.next_1d(active), sampler.next_2d(active), unguided)
-                if dr.hint(self.gratings.has_mixture, mode="scalar"):
-                    in_mixture = self.gratings.is_mixture(si, unguided)
-                    density = bsdf.pdf(ctx, si_bsdf, bs.wo, in_mixture)
-                    weight = dr.select(in_mixture & _has_failed(bs, density), 0, weight)
-                delta = mi.has_flag(bs.sampled_type, mi.BSDFFlags.Delta)
-                eta *= dr.select(guided, 1, bs.eta)
-                valid |= active & (mi.has_flag(bs.sampled_type, mi.BSDFFlags.Null) ^ True)
-                active &= ~is_last | delta
-                from_eye_only |= (depth == 1) & (delta | on_grating)
-                has_other_vertex |= on_grating ^ True
-                has_scattered |= ~delta
-                next_ray = si.spawn_ray(dr.select(guided, to_point.d, si.to_world(bs.wo)))
-                next_si = scene.ray_intersect(next_ray, active)
-                ds = self.emitters.towards(scene, next_si, si)
-                pdf_emitter = scene.pdf_emitter_direction(si, ds, active) / probability
-                # Emitters are left to emitter sampling, whose weights ignore points on gratings.
-                on_target, _ = self.gratings.classify(next_si, to_gratings & next_si.is_valid())
-                on_target &= pdf_emitter == 0
-                grating_pdf = dr.select(on_target, self.gratings.pdf_direction(next_si, next_ray), 0)
-                hidden = guided & ~(on_target & (dr.abs(next_si.t - distance) < _VISIBILITY_TOLERANCE * distance))
-                bsdf_pdf = bsdf_probability * dr.select(guided, pdf, bs.pdf)
-                value = dr.select(guided, value, weight * bs.pdf)
-                mixed = dr.select(hidden, 0, value * quotient(1, bsdf_pdf + _GRATING_PROBABILITY * grating_pdf))
-                throughput *= dr.select(to_gratings & (delta ^ True), mixed, weight / bsdf_probability)
-                active &= dr.any(throughput != 0)
-                # Emitters that are never sampled are not found by paths from the light.
-                counts = active & ((from_light & (pdf_emitter > 0)) ^ True) & (delta | (slots == 0))
-                mis_weight = _power_heuristic(bsdf_pdf, dr.select(delta, 0, pdf_emitter))
-                result += dr.select(counts, throughput * ds.emitter.eval(next_si, counts) * mis_weight, 0)
-
-                si = next_si
-                depth += 1
-                active &= si.is_valid() & (depth < self.max_depth)
-                # Russian roulette, as in `path`
-                survival = dr.minimum(dr.max(throughput) * dr.square(eta), 0.95)
-                roulette = depth >= self.rr_depth
-                active &= (roulette ^ True) | (sampler.next_1d(active) < survival)
-                throughput *= dr.select(roulette, quotient(1, survival), 1)
-            found = [(ray_wavelengths, response * result)]
-            if dr.hint(draws_wavelengths, mode="scalar"):
-                found = [*found, of_lamps]
-            return found, valid
-
-    return EyePaths
 
 
 def with_surviving_wavelengths(
@@ -389,7 +216,7 @@ def with_surviving_wavelengths(
     return replaced
 
 
-def _has_failed(bs: mi.BSDFSample3f, density: mi.Float) -> mi.Bool:
+def has_failed(bs: mi.BSDFSample3f, density: mi.Float) -> mi.Bool:
     """Return whether a sample failed in the part of a mixture that drew it, but got the value of another part.
 
     `density` is that of `pdf`. Where a one-sided part of `blendbsdf` is lit from behind, or draws a direction below the
@@ -398,18 +225,6 @@ def _has_failed(bs: mi.BSDFSample3f, density: mi.Float) -> mi.Bool:
     """
     differs = ~(dr.abs(density - bs.pdf) <= _DENSITY_TOLERANCE * bs.pdf)
     return differs & ~mi.has_flag(bs.sampled_type, mi.BSDFFlags.Delta)
-
-
-def _is_smooth_reflector(bsdf: mi.BSDF) -> mi.Bool:
-    """Return whether a BSDF has a value for all reflected directions, and no transmission, which would change η."""
-    transmits = mi.has_flag(bsdf.flags(), mi.BSDFFlags.Transmission | mi.BSDFFlags.Null)
-    return mi.has_flag(bsdf.flags(), mi.BSDFFlags.Smooth) & (transmits ^ True)
-
-
-def _power_heuristic(a: mi.Float, b: mi.Float) -> mi.Float:
-    """Return the weight; zero, as in `path`, where a is infinite, as for a lamp at grazing incidence."""
-    weight = dr.square(a) / (dr.square(a) + dr.square(b))
-    return dr.select(dr.isfinite(weight), weight, 0)
 
 
 # ---------------------------------------------------------------- from the light
@@ -671,7 +486,7 @@ class LightPaths:
         # no meaning, and may be one in which the perturbed BSDF, or another part of it, is not zero.
         evaluates_reverse = active & ((specular | reciprocal) ^ True)
         density = bsdf.pdf(ctx, si, bs.wo, evaluates_reverse)
-        active = active & ~(self.gratings.is_mixture(si, active) & _has_failed(bs, density))
+        active = active & ~(self.gratings.is_mixture(si, active) & has_failed(bs, density))
         evaluates_reverse &= active & (bs.pdf > 0)
         value = bsdf.eval(mi.BSDFContext(), _with_wi(si, bs.wo), si.wi, evaluates_reverse)
         weight = dr.select(evaluates_reverse, value * quotient(1, density), weight)
