@@ -10,7 +10,8 @@ import pytest
 from bsdf_support import bitmap, grating, uniform, use
 
 import mitsuba_diffraction  # noqa: F401 (settles which LLVM is used before a variant is set)
-from mitsuba_diffraction.integrator.paths import Gratings, LightPaths, SplatBuffer, _power_heuristic
+from mitsuba_diffraction.integrator.eye_paths import _power_heuristic
+from mitsuba_diffraction.integrator.paths import Gratings, LightPaths, SplatBuffer
 from mitsuba_diffraction.integrator.scene_cache import SceneCache
 from mitsuba_diffraction.render import scene_file
 from mitsuba_diffraction.render.scene_file import SceneFile
