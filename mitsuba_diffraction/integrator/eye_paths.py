@@ -20,7 +20,7 @@ from .scene_cache import SceneCache
 _GRATING_PROBABILITY = 0.5  # of a direction to a point on a grating
 _VISIBILITY_TOLERANCE = 1e-3  # relative, of the distance to that point
 
-Light = tuple["mi.Spectrum", "mi.Spectrum"]
+Received = tuple["mi.Spectrum", "mi.Spectrum"]
 """Four wavelengths in nm, and radiance times the weight of the sensor there."""
 
 
@@ -108,7 +108,7 @@ class EyeTracer:
         response: mi.Spectrum,
         active: mi.Bool,
         draws_wavelengths: bool,
-    ) -> tuple[list[Light], mi.Bool]:
+    ) -> tuple[list[Received], mi.Bool]:
         """Return the light along a ray, weighted by `response`, and its validity; see `EyePaths.trace`."""
         si = scene.ray_intersect(ray, active)
         # Alpha is the same as in `path`: null interactions are transparent, an environment is not.
@@ -266,7 +266,7 @@ def define_eye_paths() -> type:
 
         def trace(
             self, scene: mi.Scene, sampler: mi.Sampler, ray: mi.RayDifferential3f, weight: mi.Spectrum
-        ) -> tuple[list[Light], mi.Bool]:
+        ) -> tuple[list[Received], mi.Bool]:
             """Return four wavelengths in nm and radiance times the weight of the sensor there, and validity.
 
             If there are lamps without extent, a second pair has their light at the first vertex.
