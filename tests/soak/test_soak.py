@@ -75,6 +75,20 @@ CASES = {
     ),
     # The process ended.
     "derivative by lengths": Configuration(SINUSOID, lateral_scale=0.9, derived=5, directions=((20.0, 0.0, 0),)),
+    # f has a step where an order is at the horizon inside of a sheet, and the last bit decides on the side.
+    "order at the horizon inside of a sheet": Configuration(
+        Surface("harmonics", (1.0, 1.0), 1.1, shape=0.847, seed=77, count=1),
+        coherence_length=12.55,
+        material=1.5,
+        outside=1.55,
+        films=((Cauchy(1.728, 0.0185), 0.159),),
+        transmission="sheet",
+        height_scale=0.708,
+        shadowing="none",
+        conserve_energy=False,
+        directions=((180.0, 359.0, 0),),
+        wavelengths=(500.0, 701.0, 360.0, 380.0),
+    ),
     # Rows of bins without power were drawn, and had no density.
     "no frequency propagates": Configuration(
         Surface("ridges", (1.111, 1.111), 0.534, shape=0.5, seed=91),
