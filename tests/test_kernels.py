@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import collections
+import contextlib
 import functools
 import gc
 import re
@@ -19,8 +20,10 @@ import pytest
 from bsdf_support import WAVELENGTHS, bitmap, made_up, of_spectrum, random_directions, spectrum, uniform
 
 import mitsuba_diffraction as md
+from mitsuba_diffraction.bsdf.grating import Grating
 from mitsuba_diffraction.bsdf.layers import Layers
 from mitsuba_diffraction.bsdf.testing import array, direction, floats, interaction, vectors
+from mitsuba_diffraction.integrator import candidates, eye_paths, paths
 from mitsuba_diffraction.integrator.candidates import Candidates
 from mitsuba_diffraction.integrator.paths import unpacked
 from mitsuba_diffraction.render.scene_file import SceneFile
@@ -87,6 +90,19 @@ def scene(bsdf: dict, integrator: str = "path", **further: dict) -> mi.Scene:
     )
 
 
+def beside(**shapes: dict) -> dict:
+    """A wall that a grating lights, and other shapes."""
+    upright = mi.ScalarTransform4f().translate([-1.2, 0, 0]).rotate([0, 1, 0], 90).scale(2)
+    return {"wall": {"type": "rectangle", "to_world": upright, "bsdf": {"type": "diffuse"}}, **shapes}
+
+
+def instances() -> dict:
+    """Gratings above the other one: on an instance, which counts as any surface."""
+    place = mi.ScalarTransform4f().translate([0, 0, 1]).rotate([1, 0, 0], 180).scale(0.5)
+    group = {"type": "shapegroup", "plate": {"type": "rectangle", "bsdf": {**BLAZE, "base": {"type": "diffuse"}}}}
+    return {"group": group, "copy": {"type": "instance", "to_world": place, "group": {"type": "ref", "id": "group"}}}
+
+
 def without_double(history: list[dict]) -> bool:
     code = "\n".join(kernel["ir"].getvalue() for kernel in history)
     assert "float" in code
@@ -130,7 +146,10 @@ def test_later_frames_and_loads_have_the_kernels_of_the_first_frame():
 
 
 def test_bodies_of_loops_are_recorded_once(monkeypatch):
-    """Recording is most of the time of a small picture, and was repeated up to eight times where loops are nested."""
+    """Recording is most of the time of a small picture, and was repeated up to eight times where loops are nested.
+
+    Gratings are evaluated for a light that is drawn, a bulb, the candidate that is kept, and samples of the BSDF.
+    """
     calls = collections.Counter()
 
     def count(kind: type, name: str) -> None:
@@ -145,18 +164,45 @@ def test_bodies_of_loops_are_recorded_once(monkeypatch):
 
     bulb = {"type": "point", "position": [1, 0, 3], "intensity": uniform(1.0)}
     sky = {"type": "constant", "radiance": uniform(1e-4)}
-    built = scene(BLAZE, "diffraction_path", bulb=bulb, sky=sky)
+    built = scene(BLAZE, "diffraction_path", bulb=bulb, sky=sky, **beside())
+    built.integrator().max_depth = 5
     sensor = built.sensors()[0]
-    eye, _ = built.integrator().parts(built, sensor)
+    eye, light = built.integrator().parts(built, sensor)
     gratings = [shape.bsdf() for shape in built.shapes() if isinstance(getattr(shape.bsdf(), "layers", None), Layers)]
-    own = [eye.candidates, *(grating.layers for grating in gratings)]
+    own = [eye.candidates, *(layer for grating in gratings for layer in (grating.layers, grating.layers.grating))]
     sampler = sensor.sampler()
     sampler.seed(0, 64)
-    for kind, name in ((Candidates, "sample"), (Candidates, "_kept_of"), (Layers, "sample")):
+    for kind, name in ((Candidates, "sample"), (Candidates, "_kept_of"), (Layers, "sample"), (Grating, "evaluate")):
         count(kind, name)
     ray, weight = sensor.sample_ray_differential(0, sampler.next_1d(), sampler.next_2d(), mi.Point2f(0.5))
     eye.trace(built, sampler, ray, weight)
-    assert calls == {"sample": 3, "_kept_of": 1}
+    assert calls == {"sample": 3, "_kept_of": 1, "evaluate": 4}
+    calls.clear()
+    next(light.splats(0, 4))
+    assert calls == {"sample": 1, "evaluate": 1}
+
+
+# Pairs of a grating and of further shapes.
+LEFT_OUT = {
+    "alone": lambda: (BLAZE, beside()),
+    "with a base": lambda: ({**BLAZE, "base": {"type": "diffuse"}}, beside()),
+    "with instances": lambda: (BLAZE, beside(**instances())),
+}
+
+
+@pytest.mark.few(2)
+@pytest.mark.parametrize("name", LEFT_OUT)
+def test_gratings_that_are_not_recorded_change_no_pixel(name, monkeypatch):
+    """Where they are evaluated as black, their values are not used."""
+    bsdf, shapes = LEFT_OUT[name]()
+    sky = {"type": "constant", "radiance": uniform(1e-4)}
+    built = scene(bsdf, "diffraction_path", sky=sky, **shapes)
+    built.integrator().max_depth = 5
+    found = np.array(mi.render(built, spp=64))
+    for module in (candidates, eye_paths, paths):
+        monkeypatch.setattr(module, "gratings_left_out", lambda applies: contextlib.nullcontext())
+    np.testing.assert_allclose(found, np.array(mi.render(built, spp=64)), rtol=1e-5)
+    assert (found[..., 1] > 0).mean() > 0.9
 
 
 @pytest.mark.parametrize("count", [0, 1])

@@ -2,9 +2,12 @@
 
 from __future__ import annotations
 
+import contextlib
 import functools
 import re
 import weakref
+from collections.abc import Iterator
+from contextvars import ContextVar
 from typing import Any
 
 import drjit as dr
@@ -18,6 +21,7 @@ _CHECKED = 32  # points along u and v at which a base is checked
 _MIN_SPECULAR = 0.04  # albedo of a base that reflects specularly, too, about that of a varnish
 
 living: weakref.WeakSet[mi.BSDF] = weakref.WeakSet()  # the gratings of all scenes
+left_out: ContextVar[bool] = ContextVar("left_out", default=False)  # whether gratings are evaluated as black
 
 
 def nested_plugin(kind: str, **parameters: object) -> mi.Object:
@@ -30,6 +34,20 @@ def nested_plugin(kind: str, **parameters: object) -> mi.Object:
     for name, value in parameters.items():
         props[name] = value
     return mi.PluginManager.instance().create_object(props)
+
+
+@contextlib.contextmanager
+def gratings_left_out(applies: bool) -> Iterator[None]:
+    """Evaluate gratings as black inside a `with` block, where their values are not used.
+
+    Dr.Jit records a call for all BSDFs, also those that its mask excludes, and recording is most of the time of a small
+    picture.
+    """
+    token = left_out.set(applies)
+    try:
+        yield
+    finally:
+        left_out.reset(token)
 
 
 def is_grating(bsdf: mi.BSDF) -> bool:

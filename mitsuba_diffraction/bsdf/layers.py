@@ -7,6 +7,7 @@ from dataclasses import dataclass
 import drjit as dr
 import mitsuba as mi
 
+from .base import left_out
 from .device_tables import BELOW_ONE, smaller
 from .directions import Interface, rotated
 from .grating import Grating
@@ -172,6 +173,8 @@ class Layers:
         wo_is_sample: bool = False,
     ) -> tuple[mi.Spectrum, mi.Float]:
         """Evaluate f cos θ_o and the density, as `mi.BSDF.eval_pdf`; for `wo_is_sample` see `Grating.evaluate`."""
+        if left_out.get():
+            return mi.Spectrum(0.0), mi.Float(0.0)
         cos_i, cos_o = mi.Frame3f.cos_theta(si.wi), mi.Frame3f.cos_theta(wo)
         requested = self._requested(ctx)
         active = active & self.interface.is_incident(cos_i) & self.interface.is_incident(cos_o)

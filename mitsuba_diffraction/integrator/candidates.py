@@ -31,7 +31,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from ..bsdf.base import gratings_in, is_grating, parts
+from ..bsdf.base import gratings_in, gratings_left_out, is_grating, parts
 from ..bsdf.device_tables import BELOW_ONE, on_device, opaque
 from ..precomputation.grating_spectrum import GratingSpectrum
 from ..precomputation.spectra import Spectrum
@@ -219,7 +219,9 @@ class Candidates:
         candidate = mi.UInt32(0)
         while dr.hint(candidate < candidates, exclude=[self, bsdf, si, ctx, candidates, u, step, shift, pick, active]):
             position = dr.minimum(dr.fma(mi.Float(candidate), step, u), BELOW_ONE)
-            bs, _ = bsdf.sample(ctx, si, position, _lattice_point(position / step, shift), active)
+            # The direction alone is used.
+            with gratings_left_out(is_grating(bsdf)):
+                bs, _ = bsdf.sample(ctx, si, position, _lattice_point(position / step, shift), active)
             usable = active & ~mi.has_flag(bs.sampled_type, mi.BSDFFlags.Delta)
             usable &= (bs.wo.z != 0) if dr.hint(marks_failure, mode="scalar") else (bs.pdf > 0)
             h = dr.select(usable, self.light(si.p, si.to_world(bs.wo), usable), 0)

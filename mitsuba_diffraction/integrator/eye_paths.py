@@ -12,6 +12,7 @@ from dataclasses import dataclass
 import drjit as dr
 import mitsuba as mi
 
+from ..bsdf.base import gratings_left_out
 from .candidates import Candidates, MetEmitters
 from .lamps_without_extent import LampsWithoutExtent
 from .paths import Gratings, has_failed, loops_traced_once, quotient, widen, with_surviving_wavelengths
@@ -203,7 +204,8 @@ class EyeTracer:
         ps = self.gratings.sample(si.time, sampler.next_1d(active), sampler.next_2d(active), guided)
         to_point = si.spawn_ray_to(ps.p)
         distance = dr.norm(ps.p - to_point.o)
-        value, pdf = bsdf.eval_pdf(ctx, vertex.si_bsdf, si.to_local(to_point.d), guided)
+        with gratings_left_out(self.gratings.are_all):
+            value, pdf = bsdf.eval_pdf(ctx, vertex.si_bsdf, si.to_local(to_point.d), guided)
         active = active & ~has_ended
         unguided = active & (guided ^ True)
         bs, weight = bsdf.sample(ctx, vertex.si_bsdf, sampler.next_1d(active), sampler.next_2d(active), unguided)

@@ -14,7 +14,7 @@ import mitsuba as mi
 import numpy as np
 from numpy.typing import NDArray
 
-from ..bsdf.base import gratings_in, is_grating, parts
+from ..bsdf.base import gratings_in, gratings_left_out, is_grating, parts
 from ..bsdf.device_tables import on_device
 from .scene_cache import SceneCache
 
@@ -58,6 +58,8 @@ class Gratings:
         shapes: list of `mi.Shape`.
         instanced: those of groups, whose instances do not count.
         has_mixture: whether one of the shapes is a mixture, see `is_mixture`.
+        are_all: whether no other shape of the scene holds a grating.
+        only: whether, in addition, the BSDFs of the shapes consist of gratings only, see `classify`.
     """
 
     def __init__(self, scene: mi.Scene, cache: SceneCache) -> None:
@@ -72,6 +74,8 @@ class Gratings:
             self._choice = mi.DiscreteDistribution([area for area in areas if area > 0])
         kinds = [_kind_of(shape.bsdf()) for shape in self.shapes]
         self.has_mixture = _MIXTURE in kinds
+        self.are_all = len(self.shapes) == len(shapes) and not self.instanced
+        self.only = self.are_all and all(kind == _GRATING_ONLY for kind in kinds)
         ids = [dr.reinterpret_array(mi.UInt32, mi.ShapePtr(shape))[0] for shape in (*self.shapes, *self.instanced)]
         if not ids:
             return
@@ -485,10 +489,11 @@ class LightPaths:
         # Other BSDFs may not be reciprocal, or may perturb the normal themselves. The direction of a failed sample has
         # no meaning, and may be one in which the perturbed BSDF, or another part of it, is not zero.
         evaluates_reverse = active & ((specular | reciprocal) ^ True)
-        density = bsdf.pdf(ctx, si, bs.wo, evaluates_reverse)
-        active = active & ~(self.gratings.is_mixture(si, active) & has_failed(bs, density))
-        evaluates_reverse &= active & (bs.pdf > 0)
-        value = bsdf.eval(mi.BSDFContext(), _with_wi(si, bs.wo), si.wi, evaluates_reverse)
+        with gratings_left_out(self.gratings.only):
+            density = bsdf.pdf(ctx, si, bs.wo, evaluates_reverse)
+            active = active & ~(self.gratings.is_mixture(si, active) & has_failed(bs, density))
+            evaluates_reverse &= active & (bs.pdf > 0)
+            value = bsdf.eval(mi.BSDFContext(), _with_wi(si, bs.wo), si.wi, evaluates_reverse)
         weight = dr.select(evaluates_reverse, value * quotient(1, density), weight)
         weight *= dr.abs(quotient(dr.dot(ray.d, si.n), dr.dot(si.to_world(si.wi), si.n)))
         return ray, dr.select(active, weight, 0), specular
@@ -501,7 +506,8 @@ class LightPaths:
         ds, importance = self.sensor.sample_direction(si, lens, active)
         active &= ds.pdf > 0
         active &= self.scene.ray_test(si.spawn_ray_to(ds.p), active) ^ True
-        value = bsdf.eval(mi.BSDFContext(), _with_wi(si, si.to_local(ds.d)), si.wi, active)
+        with gratings_left_out(self.gratings.are_all):
+            value = bsdf.eval(mi.BSDFContext(), _with_wi(si, si.to_local(ds.d)), si.wi, active)
         value *= importance * dr.abs(quotient(dr.dot(ds.d, si.n), dr.dot(si.to_world(si.wi), si.n)))
         return ds.uv, value, active & dr.any(value != 0)
 

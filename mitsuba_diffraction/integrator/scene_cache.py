@@ -29,8 +29,11 @@ class SceneCache:
 
     def follow(self, scene: mi.Scene, sensor: mi.Sensor) -> None:
         """Forget what was made if the scene or the sensor is another or has changed."""
-        parameters = [item for of in (scene, sensor) for item in mi.traverse(of).items()]
-        state = [(name, _identity(value)) for name, value in parameters]
+        # The parameters of a scene include those of its sensors.
+        own = scene.sensors()
+        parameters = [item for of in (scene, *([] if sensor in own else [sensor])) for item in mi.traverse(of).items()]
+        state: list[Any] = [own.index(sensor) if sensor in own else None]
+        state += [(name, _identity(value)) for name, value in parameters]
         if state != self._state:
             # Copies, as what `traverse` returns refers to the scene, and changes with it.
             self._held, self._state, self._made = [dr.copy(dr.detach(value)) for _, value in parameters], state, {}
