@@ -12,7 +12,7 @@ from ..errors import RequestError, did_you_mean
 from ..optics.materials import DISPERSION
 from ..parameter_documentation import Parameter, listed
 from ..precomputation.recipe import MAX_PATCHES, Recipe, parameters_of_profile
-from ..surface.gratings import PROFILES, RENAMED
+from ..surface.gratings import PROFILES
 from .base import living
 from .layers import Layers
 from .parameters import GratingRequest
@@ -180,7 +180,7 @@ def refuse_wrong(props: mi.Properties) -> None:
     """
     types = {name: parameter.type for parameter in PARAMETERS for name in parameter.name.split(", ")}
     kinds, objects, profile = mi.Properties.Type, dict(props.objects()), props.get("profile")
-    is_known = isinstance(profile, str) and (profile := RENAMED.get(profile, profile)) in PROFILES
+    is_known = isinstance(profile, str) and profile in PROFILES
     nested = {name for name, value in objects.items() if isinstance(value, mi.BSDF)}  # `base_from` names others
     # `profile_name` refuses unknown profiles.
     known = {*types, *(parameters_of_profile(profile) if is_known else ())}

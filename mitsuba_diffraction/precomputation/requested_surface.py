@@ -13,7 +13,6 @@ from ..errors import RequestError, did_you_mean
 from ..optics.media import Media, MediumBelow
 from ..progress import Progress, no_progress, say
 from ..settings import SPECTRUM_PARAMETERS, TRANSMISSIONS, ScalarSettings, Settings
-from ..surface.gratings import RENAMED
 from ..surface.heightfield import HeightField
 from ..surface.prepare import repeats_without_seam
 from .recipe import Recipe, kind_of, source_named
@@ -52,8 +51,6 @@ class RequestedSurface:
             RequestError: if it is not such a text, a value is given twice, or there is no such surface.
         """
         title, values = parsed(text)
-        if title in RENAMED:
-            say("note", f"{title} is the measured skin; {RENAMED[title]} is a synthetic one")
         given = {name: value for name, value in (options or {}).items() if value is not None}
         if twice := values.keys() & given.keys():
             name = min(twice)

@@ -14,7 +14,6 @@ Raises:
 
 from __future__ import annotations
 
-import warnings
 from collections.abc import Callable, Mapping
 
 import numpy as np
@@ -436,38 +435,18 @@ PROFILES: dict[str, Callable[..., HeightField]] = {
 }
 """Name in recipes and scenes → function."""
 
-RENAMED = {name: f"{name}_synthetic" for name in ("elaphe", "xenopeltis")}
-"""Name of a profile until version 0.2 → its name now, as the measured skins have the former."""
-
 
 def profile_name(name: object) -> str:
     """Return the name of a profile.
 
     Raises:
         RequestError: if there is no such profile.
-
-    Warns:
-        FutureWarning: if the name is a former one.
     """
-    if isinstance(name, str) and name in RENAMED:
-        warnings.warn(
-            f"profile {name}: got the former name of {RENAMED[name]}, a synthetic skin; the measured one is the recipe "
-            f"{name}.toml. The former name will be refused from version 0.4 on",
-            FutureWarning,
-            stacklevel=2,
-        )
-        return RENAMED[name]
     if not (isinstance(name, str) and name in PROFILES):
         raise RequestError(
             f"profile: got {name!r}, wanted one of {', '.join(PROFILES)}{did_you_mean(str(name), PROFILES)}"
         )
     return name
-
-
-def __getattr__(name: str) -> Callable[..., HeightField]:
-    if name in RENAMED:
-        return PROFILES[profile_name(name)]
-    raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
 
 
 COHERENCE_LENGTHS: dict[str, float] = dict.fromkeys(

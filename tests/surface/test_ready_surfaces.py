@@ -375,12 +375,10 @@ NAMED = {
 
 @pytest.mark.parametrize("skin", ["elaphe", "xenopeltis"])
 def test_a_skin_is_the_measured_one_and_its_synthetic_replica_says_so(skin):
-    with pytest.warns(FutureWarning, match=f"former name of {skin}_synthetic, a synthetic skin; the measured one is"):
-        recipe = Recipe({"profile": skin, "size": 7.0})
-    assert recipe.surface["profile"] == f"{skin}_synthetic"
-    assert "synthetic" in recipe.height_field().source
-    with pytest.warns(FutureWarning, match="former name"):
-        assert getattr(md.gratings, skin) is PROFILES[f"{skin}_synthetic"]
+    with pytest.raises(ValueError, match=f"^profile: got '{skin}', wanted one of .*{skin}_synthetic"):
+        Recipe({"profile": skin, "size": 7.0})
+    assert not hasattr(md.gratings, skin)
+    assert "synthetic" in Recipe({"profile": f"{skin}_synthetic", "size": 7.0}).height_field().source
     measured = Recipe.load(source_named(skin))
     assert measured.surface["scan"] == f"measured/{skin}_afm_65um.png"
     assert not {"elaphe", "xenopeltis"} & PROFILES.keys()
