@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from typing import Any, TypeVar, cast
 
 import drjit as dr
@@ -31,7 +31,7 @@ class SceneCache:
         """Forget what was made if the scene or the sensor is another or has changed."""
         # The parameters of a scene include those of its sensors.
         own = scene.sensors()
-        parameters = [item for of in (scene, *([] if sensor in own else [sensor])) for item in mi.traverse(of).items()]
+        parameters = [item for of in (scene, *([] if sensor in own else [sensor])) for item in _parameters(of)]
         state: list[Any] = [own.index(sensor) if sensor in own else None]
         state += [(name, _identity(value)) for name, value in parameters]
         if state != self._state:
@@ -43,6 +43,12 @@ class SceneCache:
         if name not in self._made:
             self._made[name] = make()
         return cast(Made, self._made[name])
+
+
+def _parameters(of: mi.Object) -> Iterator[tuple[str, Any]]:
+    """Yield the names and values of the parameters that have one: Mitsuba cannot read those of `hair` that do not."""
+    parameters = mi.traverse(of)
+    return ((name, parameters[name]) for name, (value, *_) in parameters.properties.items() if value is not None)
 
 
 def _identity(value: Any) -> Any:

@@ -148,6 +148,14 @@ def test_what_a_scene_needs_is_made_once(monkeypatch):
     assert len(made) == 1
 
 
+def test_parameters_without_a_value_are_left_out():
+    # `hair` lists `sigma_a`, though it has pigments instead.
+    cache = SceneCache()
+    scene = mi.load_dict({"type": "scene", "wig": {"type": "sphere", "bsdf": {"type": "hair"}}})
+    cache.follow(scene, mi.load_dict({"type": "perspective"}))
+    assert cache.once("number", lambda: 1) == cache.once("number", lambda: 2) == 1
+
+
 def test_a_change_of_any_number_of_the_scene_or_of_a_sensor_beside_it_is_noticed():
     scene, cache, made = loaded(), SceneCache(), []
     apart = mi.load_dict({"type": "perspective", "fov": 40, "to_world": seen_from(1.0)})

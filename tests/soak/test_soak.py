@@ -148,7 +148,10 @@ def repeat(judged, what, minutes, seed, capsys):
         except Exception as error:
             faults.append(seed)
             with capsys.disabled():
-                print(f"\n--soak-seed {seed}: {''.join(traceback.format_exception_only(error))}", flush=True)
+                # With its cause, which Mitsuba hides behind an error of its own.
+                said = (error, error.__cause__) if error.__cause__ else (error,)
+                lines = "".join(line for one in said for line in traceback.format_exception_only(one))
+                print(f"\n--soak-seed {seed}: {lines}", flush=True)
         seed += 1
         elapsed = time.monotonic() - start
         if time.monotonic() > report + 300 or before == tried:
