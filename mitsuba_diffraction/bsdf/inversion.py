@@ -22,7 +22,7 @@ from numpy.typing import NDArray
 
 from ..energy.table import Layout
 from ..precomputation.grating_spectrum import GratingSpectrum
-from .device_tables import BELOW_ONE, PacketTable, integer_part, larger, limited, opaque, smaller
+from .device_tables import BELOW_ONE, NumberTable, integer_part, larger, limited, opaque, smaller
 from .directions import Incidence, cell_of, on_square
 
 KAPPA_BINS = 4  # the components of a packet
@@ -128,7 +128,8 @@ class AliasTable:
 
         n p_i = t_i + Σ_j [a_j = i] (1 − t_j)
 
-    i is drawn uniformly; it is replaced by a_i with the probability 1 − t_i.
+    i is drawn uniformly; it is replaced by a_i with the probability 1 − t_i. Both are packed into a word of 32 bits, in
+    which a_i leaves 20 bits or more for t_i if n ≤ 4096.
     """
 
     def __init__(self, weights: NDArray[np.float64]) -> None:
@@ -163,14 +164,19 @@ class AliasTable:
             rest[ends] += p[of_each[ends], following] - 1
             low += fills
             high += ends
-        self._table = PacketTable(np.stack([threshold.clip(0, 1), alias], axis=-1), width=2)
+        self._bits = max(1, (self.count - 1).bit_length())
+        self._unit = 0.5 ** (32 - self._bits)
+        # Rounded up, so that each i with a probability is drawn.
+        units = np.minimum(np.ceil(threshold.clip(0, 1) / self._unit), 1 / self._unit - 1).astype(np.uint32)
+        self._words = NumberTable(units << np.uint32(self._bits) | alias.astype(np.uint32))
 
     def draw(self, distribution: mi.UInt32, u: mi.Float, active: mi.Bool) -> tuple[mi.Int32, mi.Float]:
         """Draw an index from one of the distributions; return it, and `u` rescaled to a number uniform in [0, 1)."""
         scaled = u * self.count
         index = integer_part(smaller(scaled, self.count - 1))
         scaled = limited(scaled - mi.Float(index), 0, BELOW_ONE)
-        threshold, alias = self._table(distribution * self.count + index, active)
+        word = self._words(distribution * self.count + index, active)
+        threshold, alias = self._unit * mi.Float(mi.Int32(word >> self._bits)), word & ((1 << self._bits) - 1)
         is_own = scaled < threshold
         rest = dr.select(is_own, scaled, scaled - threshold) / larger(
             dr.select(is_own, threshold, 1 - threshold), 1e-30
