@@ -148,7 +148,8 @@ def test_later_frames_and_loads_have_the_kernels_of_the_first_frame():
 def test_bodies_of_loops_are_recorded_once(monkeypatch):
     """Recording is most of the time of a small picture, and was repeated up to eight times where loops are nested.
 
-    Gratings are evaluated for a light that is drawn, a bulb, the candidate that is kept, and samples of the BSDF.
+    Gratings are evaluated for a light that is drawn, a bulb, the candidate that is kept, and samples of the BSDF. Four
+    candidates are drawn in one body.
     """
     calls = collections.Counter()
 
@@ -176,7 +177,7 @@ def test_bodies_of_loops_are_recorded_once(monkeypatch):
         count(kind, name)
     ray, weight = sensor.sample_ray_differential(0, sampler.next_1d(), sampler.next_2d(), mi.Point2f(0.5))
     eye.trace(built, sampler, ray, weight)
-    assert calls == {"sample": 3, "_kept_of": 1, "evaluate": 4}
+    assert calls == {"sample": 6, "_kept_of": 1, "evaluate": 4}
     calls.clear()
     next(light.splats(0, 4))
     assert calls == {"sample": 1, "evaluate": 1}

@@ -44,6 +44,7 @@ SLOTS, SLOTS_OF_CONTINUA = 4, 1  # J
 DEFENSIVE_FRACTION = 0.1  # β
 MIN_GAIN = 6.0  # of h by light samples over that in all directions, from which candidates are drawn
 MAX_NARROW_LOBE = 0.05  # σ_q in cycles/µm, up to which each wavelength has its own slot
+_AT_ONCE = 4  # candidates drawn in an iteration, of which M is a multiple
 _DIRECTIONS = 2**15  # for this comparison
 # Of a lattice with low discrepancy in two dimensions: 1/g and 1/g², g³ = g + 1.
 _LATTICE = (0.7548776662466927, 0.5698402909980532)
@@ -213,27 +214,34 @@ class Candidates:
     def _kept_of(
         self, bsdf: mi.BSDF, si: mi.SurfaceInteraction3f, of_slot: tuple, active: mi.Bool
     ) -> tuple[mi.Vector3f, mi.Float]:
+        """Draw the candidates of one BSDF, as `_kept`.
+
+        What depends on the point alone, such as textures, is computed once in an iteration, as Dr.Jit finds equal
+        expressions.
+        """
         candidates, u, step, shift, chosen, pick = of_slot
         ctx, marks_failure = mi.BSDFContext(), _marks_failure(bsdf)
+        at_once = (1, _AT_ONCE)[marks_failure]  # densities make kernels large
         omega, guess, sum_of_guesses = mi.Vector3f(0, 0, 1), mi.Float(0), mi.Float(0)
         candidate = mi.UInt32(0)
         while dr.hint(candidate < candidates, exclude=[self, bsdf, si, ctx, candidates, u, step, shift, pick, active]):
-            position = dr.minimum(dr.fma(mi.Float(candidate), step, u), BELOW_ONE)
-            # The direction alone is used.
-            with gratings_left_out(is_grating(bsdf)):
-                bs, _ = bsdf.sample(ctx, si, position, _lattice_point(position / step, shift), active)
-            usable = active & ~mi.has_flag(bs.sampled_type, mi.BSDFFlags.Delta)
-            usable &= (bs.wo.z != 0) if dr.hint(marks_failure, mode="scalar") else (bs.pdf > 0)
-            h = dr.select(usable, self.light(si.p, si.to_world(bs.wo), usable), 0)
-            sum_of_guesses += h
-            # A single random number serves all decisions: given one of them, it is uniform after division.
-            scaled = chosen * sum_of_guesses
-            takes = scaled < h
-            scaled = dr.select(takes, scaled / h, (scaled - h) / (sum_of_guesses - h))
-            chosen = dr.select(h > 0, scaled, chosen)
-            takes = dr.select(pick < candidates, candidate == pick, takes)
-            omega, guess = dr.select(takes, bs.wo, omega), dr.select(takes, h, guess)
-            candidate += 1
+            for _ in range(at_once):
+                position = dr.minimum(dr.fma(mi.Float(candidate), step, u), BELOW_ONE)
+                # The direction alone is used.
+                with gratings_left_out(marks_failure):
+                    bs, _ = bsdf.sample(ctx, si, position, _lattice_point(position / step, shift), active)
+                usable = active & ~mi.has_flag(bs.sampled_type, mi.BSDFFlags.Delta)
+                usable &= (bs.wo.z != 0) if dr.hint(marks_failure, mode="scalar") else (bs.pdf > 0)
+                h = dr.select(usable, self.light(si.p, si.to_world(bs.wo), usable), 0)
+                sum_of_guesses += h
+                # A single random number serves all decisions: given one of them, it is uniform after division.
+                scaled = chosen * sum_of_guesses
+                takes = scaled < h
+                scaled = dr.select(takes, scaled / h, (scaled - h) / (sum_of_guesses - h))
+                chosen = dr.select(h > 0, scaled, chosen)
+                takes = dr.select(pick < candidates, candidate == pick, takes)
+                omega, guess = dr.select(takes, bs.wo, omega), dr.select(takes, h, guess)
+                candidate += 1
         return omega, dr.select(guess > 0, guess / sum_of_guesses, 0)
 
 
@@ -256,14 +264,17 @@ def _points_of_instances(scene: mi.Scene, u: mi.Point3f) -> mi.Point3f:
 
 
 def _marks_failure(bsdf: mi.BSDF) -> bool:
-    """Return whether `sample` of a BSDF returns a direction in the surface where it fails, and `pdf` is not needed.
+    """Return whether `sample` of a BSDF, where it fails, returns a direction in the surface, or one without any light.
 
-    So do gratings, and BSDFs of Mitsuba that perturb or flip the frame.
+    Then `pdf` is not needed. So do gratings, BSDFs of Mitsuba that perturb or flip the frame, and blends of parts that
+    only reflect, in which a direction below the horizon has no value.
     """
-    nested = parts(bsdf, mi.BSDF)
-    if is_grating(bsdf):
+    name, nested = bsdf.class_name(), parts(bsdf, mi.BSDF)
+    if is_grating(bsdf) or name in ("RoughConductor", "SmoothDiffuse"):
         return True
-    return bsdf.class_name() in ("TwoSidedBRDF", "NormalMap", "BumpMap") and all(map(_marks_failure, nested))
+    if name == "BlendBSDF" and bsdf.flags() & +mi.BSDFFlags.Transmission:
+        return False
+    return name in ("TwoSidedBRDF", "NormalMap", "BumpMap", "BlendBSDF") and all(map(_marks_failure, nested))
 
 
 def _lattice_point(number: mi.Float, shift: mi.Point2f) -> mi.Point2f:

@@ -325,8 +325,23 @@ def test_every_bin_of_a_scene_agrees_with_path(name, depth, llvm):
     assert_bins_agree(name, depth)
 
 
+def blend(*bsdfs):
+    return {"type": "blendbsdf", "weight": 0.35, **{f"bsdf{k}": bsdf for k, bsdf in enumerate(bsdfs)}}
+
+
+@pytest.mark.parametrize("other", ["film", "glass", "plastic"])
+def test_failures_in_a_blend_are_told_by_densities(other, llvm):
+    """Where a part transmits light, or is of another class, directions of failed samples may have a value."""
+    others = {
+        "film": profile(int_ior=1.5, transmission="sheet"),
+        "glass": {"type": "roughdielectric"},
+        "plastic": {"type": "roughplastic"},
+    }
+    assert not _marks_failure(mi.load_dict(blend(surface("blazed", 1.5), others[other])))
+
+
 @pytest.mark.slow
-@pytest.mark.parametrize("kind", ["grating", "twosided", "normalmap", "bumpmap"])
+@pytest.mark.parametrize("kind", ["grating", "twosided", "normalmap", "bumpmap", "metal", "paint"])
 def test_a_sample_that_fails_lies_in_the_surface_or_has_no_value(kind, llvm):
     """The names of these classes of Mitsuba stand for it where candidates are drawn without their densities."""
     nested = surface("blazed", 1.5)
@@ -336,6 +351,8 @@ def test_a_sample_that_fails_lies_in_the_surface_or_has_no_value(kind, llvm):
         "twosided": {"type": "twosided", "bsdf": nested},
         "normalmap": {"type": "normalmap", "normalmap": tilted, "bsdf": nested},
         "bumpmap": {"type": "bumpmap", "texture": bitmap(np.arange(64.0).reshape(8, 8) / 64), "bsdf": nested},
+        "metal": blend(nested, {"type": "roughconductor", "material": "Al", "alpha": 0.7}),
+        "paint": blend(nested, {"type": "diffuse"}),
     }[kind]
     count, rng = 1 << 16, np.random.default_rng(1)
     wi = rng.normal(size=(count, 3))
