@@ -1,6 +1,7 @@
 """Error messages: they name what is missing or wrong, and what is available."""
 
 import ast
+import re
 import shutil
 from pathlib import Path
 
@@ -16,6 +17,15 @@ SCENE = """<scene version="3.0.0"><default name="light" value="sun"/><include fi
 <sensor type="perspective"/><shape type="sphere">%s</shape></scene>"""
 GRATING = '<bsdf type="diffraction_grating">%s</bsdf>'
 BLAZED = '<string name="profile" value="blazed"/><float name="period" value="2.5"/><float name="depth" value="0.25"/>'
+
+
+WORDS = {
+    r"light (that|which) (passes|comes|goes|is sent)": "transmitted, incident or outgoing light",
+    r"pass(es|ing)? off": "an order at its Rayleigh anomaly",
+    r"by as much again": "by the same factor",
+    r"(a|the|its|their) share of (the )?(light|power)": "a fraction",
+}
+"""Patterns that are not terms of optics, and what to write."""
 
 
 @pytest.mark.parametrize(
@@ -185,3 +195,15 @@ def test_every_material_of_mitsuba_is_known(llvm):
         bsdf = mi.load_dict({"type": "diffraction_grating", "profile": "blazed", "period": 2.5, "depth": 0.25,
                              "tolerance": 0.05, "coherence_length": 5.0, "material": material})  # fmt: skip
         assert f"reflectance = {'none (R = 1)' if material == 'none' else f'conductor, {material}'}" in str(bsdf)
+
+
+def test_texts_have_the_terms_of_optics():
+    root = Path(mitsuba_diffraction.__file__).parent
+    paths = [path for path in root.rglob("*.py") if "assets" not in path.parts]
+    for folder in ("", "docs", "precompute", "scenes", "notebooks"):
+        paths += (SCENES.parent / folder).glob("*.md")
+    assert len(paths) > 200
+    for path in paths:
+        text = " ".join(path.read_text(encoding="utf-8").split())
+        for pattern, better in WORDS.items():
+            assert not (found := re.search(rf"\b{pattern}\b", text)), f"{path.name}: {found[0]!r}, wanted {better}"

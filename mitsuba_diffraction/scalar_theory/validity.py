@@ -132,7 +132,7 @@ class ScalarError:
     """The error of scalar theory for one surface: the mean over `ERROR_ANGLES` and some wavelengths.
 
     Attributes:
-        share: Σ|Δη_m| as a fraction of the reflected power; infinite outside the stored map (depths above 2 λ).
+        reflected: Σ|Δη_m| as a fraction of the reflected power; infinite outside the stored map (depths above 2 λ).
         transmitted: the same for transmitted light; None below a medium that absorbs it.
         estimated: whether it is from the stored map, within about `ESTIMATE_FACTOR`, instead of solved for the surface.
         remedy: the alternative to scalar theory for this surface.
@@ -140,7 +140,7 @@ class ScalarError:
         medium: below the surface, for which it holds.
     """
 
-    share: float
+    reflected: float
     transmitted: float | None
     estimated: bool
     remedy: str
@@ -155,15 +155,15 @@ class ScalarError:
     @property
     def warning(self) -> str:
         """A sentence if the error exceeds the bound, otherwise ""."""
-        return f"scalar theory: {self}; {self.remedy}" if self.share > self.bound else ""
+        return f"scalar theory: {self}; {self.remedy}" if self.reflected > self.bound else ""
 
     def __str__(self) -> str:
         first, last = (f"{1e3 * wavelength:.0f}" for wavelength in (self.wavelengths[0], self.wavelengths[-1]))
         light = f"{first} nm" if first == last else f"{first}–{last} nm"
-        if not np.isfinite(self.share):
+        if not np.isfinite(self.reflected):
             return f"error unknown, the surface is deeper than two wavelengths ({light})"
         about = "about " if self.estimated else ""
-        errors = ((self.share, "reflected light"), (self.transmitted, "transmitted"))
+        errors = ((self.reflected, "reflected light"), (self.transmitted, "transmitted"))
         parts = [
             f"{float(f'{100 * error:.2g}'):g}% of the {of_light}" for error, of_light in errors if error is not None
         ]
@@ -221,8 +221,8 @@ class Waves:
         inside, remedy = [wavelength / index for wavelength in wavelengths], self.remedy(light[0] * 1e-3 / index)
         if not transparent:
             return ScalarError(self._estimated("Al", inside), None, True, remedy, wavelengths, "aluminium")
-        share, transmitted = (self._estimated(name, inside) for name in ("dielectric", "transmitted"))
-        return ScalarError(share, transmitted, True, remedy, wavelengths)
+        reflected, transmitted = (self._estimated(name, inside) for name in ("dielectric", "transmitted"))
+        return ScalarError(reflected, transmitted, True, remedy, wavelengths)
 
     def _estimated(self, material: str, wavelengths: Sequence[float]) -> float:
         """Return the mean error over wavelengths in µm; infinite for too large a depth."""

@@ -175,14 +175,14 @@ def test_the_error_of_scalar_theory_is_that_on_the_medium_below(lines, blaze, gl
     """Values: Σ|Δη|/Ση of the printed efficiencies of both theories, at 0° and ±20°, and 450, 550 and 650 nm."""
     surface = md.gratings.ruled(lines, blaze_wavelength=blaze)
     found = [scalar_theory.scalar_error(surface, below=MediumBelow.of(material)) for material in (None, "Al")]
-    assert [error.share for error in found] == pytest.approx([glass, aluminium], rel=0.01)
+    assert [error.reflected for error in found] == pytest.approx([glass, aluminium], rel=0.01)
     assert found[0].transmitted is not None
     assert found[1].transmitted is None
     assert str(found[1]).endswith(" of the reflected light (mean over 450–650 nm and 0–20°, Al)")
     # The estimate of scenes has one metal, and sinusoids.
     estimated = validity.scalar_waves(surface).error(transparent=False)
     assert str(estimated).endswith(", aluminium)")
-    assert 0.5 < estimated.share / aluminium < 2
+    assert 0.5 < estimated.reflected / aluminium < 2
 
 
 def test_lines_in_another_direction_have_rigorous_theory_once_they_are_turned():
@@ -209,7 +209,7 @@ def test_a_surface_outside_the_range_of_scalar_theory_is_reported():
     assert deep.endswith("scenes have rigorous theory for periods of up to 3.6 µm, `efficiency` for longer ones")
     for flat in (md.HeightField(np.zeros((1, 8)), 0.1), md.HeightField(np.full((8, 8), 0.7), 0.1)):
         for extent in ("tile", "sample"):
-            assert scalar_theory.scalar_error(flat, extent).share == 0
+            assert scalar_theory.scalar_error(flat, extent).reflected == 0
 
 
 @pytest.mark.few(2)
@@ -218,7 +218,7 @@ def test_a_surface_outside_the_range_of_scalar_theory_is_reported():
 def test_no_surface_within_the_promised_range_is_warned_of(name, period):
     # Period ≥ 5 λ and depth ≤ λ/2 from 450 to 650 nm: within 2 % (sinusoids) and 8 % (blazes), as in the README.
     found = scalar_theory.scalar_error(md.gratings.PROFILES[name](period, 0.225))
-    assert found.share < {"sinusoidal": 0.02, "blazed": 0.08}[name]
+    assert found.reflected < {"sinusoidal": 0.02, "blazed": 0.08}[name]
     assert found.warning == ""
 
 
@@ -245,7 +245,7 @@ def test_error_of_a_profile_is_that_of_coupled_waves(monkeypatch):
     assert len(stored) == 4
     found = scalar_theory.scalar_error(md.gratings.blazed(2.5, 0.25))
     assert not found.estimated
-    assert found.share == pytest.approx(np.mean(stored), abs=0.005)
+    assert found.reflected == pytest.approx(np.mean(stored), abs=0.005)
 
 
 def test_equal_profiles_are_solved_once(monkeypatch):
@@ -274,8 +274,8 @@ def test_the_error_depends_on_lengths_in_wavelengths(surface, scale):
     )
     assert found.estimated == expected.estimated
     # Waves are sorted into sixteenths of an octave.
-    assert found.share == pytest.approx(expected.share, rel=0.02)
-    assert scalar_theory.scalar_error(larger).share != pytest.approx(expected.share, rel=0.1)  # in other light
+    assert found.reflected == pytest.approx(expected.reflected, rel=0.02)
+    assert scalar_theory.scalar_error(larger).reflected != pytest.approx(expected.reflected, rel=0.1)  # in other light
 
 
 def test_a_relief_for_infrared_light_is_not_judged_by_visible_light():
@@ -314,7 +314,7 @@ def test_estimated_error_is_near_the_solved_one(count):
             patch.setattr(validity, "is_profile", lambda surface: False)
             estimated = scalar_theory.scalar_error(profile)
         assert (solved.estimated, estimated.estimated) == (False, True)
-        factors.append(np.log(estimated.share / solved.share))
+        factors.append(np.log(estimated.reflected / solved.reflected))
     assert np.exp(np.sqrt(np.mean(np.square(factors)))) < 1.5
     assert np.exp(np.abs(factors).max()) < 3
 

@@ -491,7 +491,7 @@ def test_inspect_precompute_and_the_log_agree_on_the_error_of_scalar_theory(fold
     assert len(warned[0]) == 1
     (printed,) = re.findall(r"^scalar theory +(errs by .*\))", said[0], re.MULTILINE)
     assert warned[0] == [f"{printed}; theory=rigorous has it right"]
-    error = json.loads(Path("n.json").read_text())["scalar_error"]["share"]
+    error = json.loads(Path("n.json").read_text())["scalar_error"]["reflected"]
     assert printed.startswith(f"errs by {100 * error:.0f}% ")
 
 

@@ -121,7 +121,7 @@ def solved(surface: md.HeightField, points: float, layers: float, stepped: bool)
         "period": [round(length, 4) for length in period],
         "range": round(float(np.ptp(heights)), 4),
         "voxels": [*counts, count],
-        "estimated": [float(f"{value:.4g}") for value in (estimate.share, estimate.transmitted)],
+        "estimated": [float(f"{value:.4g}") for value in (estimate.reflected, estimate.transmitted)],
         "error": [float(f"{value:.4g}") for value in errors],
         "lost": float(f"{lost:.1e}"),
         "seconds": round(time.process_time() - began),

@@ -86,7 +86,7 @@ def properties(scale: float) -> list[str]:
     low, high = np.percentile(heights, [1, 99])
     slope = np.hypot(*np.gradient(heights, *field.pixel_size))
     mirror = [abs(np.exp(4j * np.pi / wavelength * heights).mean()) ** 2 for wavelength in (0.45, 0.55, 0.65)]
-    error = scalar_error(HeightField(heights, field.pixel_size), "sample").share
+    error = scalar_error(HeightField(heights, field.pixel_size), "sample").reflected
     return [
         f"{1e3 * heights.std():.0f} nm",
         f"{1e3 * (high - low):.0f} nm",

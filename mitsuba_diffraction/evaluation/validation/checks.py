@@ -48,4 +48,4 @@ def surface_checks(height_field: HeightField, spectrum: GratingSpectrum) -> tupl
 def scalar_range(height_field: HeightField, extent: str) -> Record:
     """Return the error of scalar theory, as `inspect` and `precompute` report it."""
     found = scalar_error(height_field, extent)
-    return Record(found.share, 0.0, found.bound, note=str(found))
+    return Record(found.reflected, 0.0, found.bound, note=str(found))
