@@ -1,5 +1,6 @@
 """What people expect of a repository: one version, workflows that run what the documentation names."""
 
+import json
 import re
 import sys
 from pathlib import Path
@@ -21,6 +22,8 @@ def test_the_version_is_the_same_everywhere():
     version = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]["version"]
     assert md.__version__ == version
     assert re.search(r"^version: (.+)$", (ROOT / "CITATION.cff").read_text(), re.MULTILINE)[1] == version
+    three = (ROOT / "mitsuba_diffraction" / "export" / "assets" / "three" / "package.json").read_text()
+    assert json.loads(three)["version"] == version
     wheels = re.findall(r"mitsuba_diffraction-([\d.]+)-py3", (ROOT / "README.md").read_text())
     assert set(wheels) <= {version}
 
