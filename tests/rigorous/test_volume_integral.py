@@ -16,9 +16,10 @@ def of(found, m, eta):
     return eta[:, [where[tuple(pair)] for pair in np.asarray(m).tolist()]]
 
 
+@pytest.mark.parametrize("side", [1, -1], ids=["above", "below"])
 @pytest.mark.parametrize("direction", [(0, 0), (20, 0), (20, 90), (40, 45)])
-def test_a_profile_has_the_orders_of_the_coordinate_transformation_method(direction):
-    surface, light = gratings.sinusoidal(2.5, 0.5, samples=512), incident_direction(*direction)
+def test_a_profile_has_the_orders_of_the_coordinate_transformation_method(direction, side):
+    surface, light = gratings.sinusoidal(2.5, 0.5, samples=512), incident_direction(*direction) * (1, 1, side)
     exact = rigorous.efficiencies(surface, light, WAVELENGTH, int_ior=INDEX, tolerance=1e-4)
     found = extrapolated(surface.heights, (2.5, 2.5), light, WAVELENGTH, INDEX, (1, 64), 32, dtype=np.complex128)
     reflected, transmitted = (np.stack([m, 0 * m], axis=1) for m in (exact.orders, exact.transmitted_orders))

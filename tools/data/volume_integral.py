@@ -38,8 +38,10 @@ class Orders:
 
     Attributes:
         reflected, transmitted: (m_x, m_y), (n, 2), each; k_o,∥ = −k_i,∥ − m λ/T as everywhere in this package.
-        eta, eta_transmitted: fraction of the incident power in each, (2, n): s- and p-polarised incident light.
-        iterations: of GMRES, the larger number of the two polarisations.
+            Reflected are those on the side of the light.
+        eta, eta_transmitted: fraction of the incident power in each, (2, n): s- and p-polarised incident light, or
+            those that were solved.
+        iterations: of GMRES, the largest number of the polarisations.
     """
 
     reflected: NDArray[np.int64]
@@ -50,7 +52,7 @@ class Orders:
 
     @property
     def lost(self) -> float:
-        """|1 − R − T|, the larger of the two polarisations."""
+        """|1 − R − T|, the largest of the polarisations."""
         return float(np.abs(1 - self.eta.sum(axis=1) - self.eta_transmitted.sum(axis=1)).max())
 
 
@@ -116,13 +118,14 @@ def solve(
     tolerance: float = 1e-4,
     dtype: type = np.complex64,
     stepped: bool = False,
+    polarisations: tuple[int, ...] = (0, 1),
 ) -> Orders:
     """Solve Maxwell's equations for one period of a relief.
 
     Args:
         heights: (rows, columns) µm, rows ↔ +y, at the middles of pixels.
         period: along x and y, µm.
-        light: ω_i, (3,), towards the light, in air.
+        light: ω_i, (3,), towards the light, in air, or in the substrate if ω_i,z < 0.
         wavelength: in air, µm.
         index: n of the relief and the substrate.
         points: (rows, columns) of voxels in one period; 1 row for a profile along x.
@@ -131,11 +134,12 @@ def solve(
         dtype: of the fields.
         stepped: whether pixels are flat, with vertical walls on the faces of voxels; otherwise the heights are
             interpolated.
+        polarisations: of the incident light, 0 is s.
     """
     fine = tuple(1 if n == 1 else n * _SUBPIXELS for n in points)
     chi, thickness = susceptibility((repeated if stepped else resampled)(heights, fine), period, index, layers)
     chi = chi.astype(np.float32 if dtype is np.complex64 else np.float64)
-    return _Period(chi, thickness, period, light, wavelength, index, tolerance, dtype).orders()
+    return _Period(chi, thickness, period, light, wavelength, index, tolerance, dtype).orders(polarisations)
 
 
 def extrapolated(
@@ -184,7 +188,8 @@ class _Period:
         self._layers, rows, columns = chi.shape[1:]
         k0 = 2 * np.pi / wavelength
         self._m = np.stack(np.meshgrid(*(scipy.fft.fftfreq(n, 1 / n) for n in (columns, rows))), axis=-1)
-        tangent = -np.asarray(light[:2])
+        self._from_below = light[2] < 0
+        tangent = -np.asarray(light[:2]) * (index if self._from_below else 1)
         k = k0 * (tangent + self._m * wavelength / np.asarray(period))
         square, epsilon = (k**2).sum(axis=-1), index**2
         self._gamma, self._below = (np.sqrt(k0**2 * (e + 1j * _LOSS) - square + 0j) for e in (1.0, epsilon))
@@ -254,31 +259,36 @@ class _Period:
         x, y, z = field
         return np.stack([xx * x + xy * y + xz * z, xy * x + yy * y + yz * z, xz * x + yz * y + zz * z])
 
-    def orders(self) -> Orders:
-        """Solve for both polarisations."""
-        found = [self._solved(polarisation) for polarisation in (0, 1)]
-        cos_i = self._gamma[0, 0].real
+    def orders(self, polarisations: tuple[int, ...]) -> Orders:
+        """Solve for each polarisation."""
+        found = [self._solved(polarisation) for polarisation in polarisations]
+        incident = (self._below if self._from_below else self._gamma)[0, 0].real
 
         def kept(gamma: Complex) -> NDArray[np.bool_]:
             return (gamma.real > 1e-3 * self._k0) & (np.abs(gamma.imag) < 1e-3 * self._k0)
 
-        up, down = kept(self._gamma), kept(self._below)
-        eta = [sum(np.abs(a[up]) ** 2 for a in reflected) * self._gamma.real[up] / cos_i for reflected, _, _ in found]
-        eta_t = [sum(np.abs(a[down]) ** 2 for a in below) * self._below.real[down] / cos_i for _, below, _ in found]
-        reflected, transmitted = (-np.rint(self._m[mask]).astype(int) for mask in (up, down))
-        return Orders(reflected, np.array(eta), transmitted, np.array(eta_t), max(count for *_, count in found))
+        sides = []
+        for side, gamma in enumerate((self._gamma, self._below)):
+            propagates = kept(gamma)
+            power = [sum(np.abs(a[propagates]) ** 2 for a in of_both[side]) for of_both in found]
+            m = -np.rint(self._m[propagates]).astype(int)
+            sides.append((m, np.array(power) * gamma.real[propagates] / incident))
+        (reflected, eta), (transmitted, eta_t) = sides[::-1] if self._from_below else sides
+        return Orders(reflected, eta, transmitted, eta_t, max(count for *_, count in found))
 
     def _solved(self, polarisation: int) -> tuple[list[Complex], list[Complex], int]:
-        """Return the amplitudes of s and p, reflected and transmitted, for one polarisation of incident light."""
+        """Return the amplitudes of s and p, above and below, for one polarisation of incident light."""
         shape = 3, *self._chi.shape[1:]
         size = int(np.prod(shape))
-        # Of a wave of amplitude one at the top of the relief.
-        through = self._through[0, 0]
-        up_0 = self._r[polarisation][0, 0] * through
+        through, r = self._through[0, 0], self._r[polarisation][0, 0]
+        # E₀: amplitudes of the wave up at z = 0 and of that down at the top of the relief.
+        up_0, down_top = r * through, 1.0
+        if self._from_below:
+            up_0, down_top = (self._t[polarisation] * self._below / self._gamma)[0, 0], 0.0
         incident, layers = np.zeros(shape, complex), np.arange(self._layers)
         waves = complex(self._half[0, 0]) * complex(self._step[0, 0]) ** layers
         up, down = (np.array([part[0, 0] for part in self._vectors(way)[polarisation]]) for way in (True, False))
-        incident[..., 0, 0] = up[:, None] * (up_0 * waves) + down[:, None] * waves[::-1]
+        incident[..., 0, 0] = up[:, None] * (up_0 * waves) + down[:, None] * (down_top * waves[::-1])
 
         def to_points(coefficients: Complex) -> Complex:
             return scipy.fft.ifft2(coefficients, norm="forward", overwrite_x=True)
@@ -311,9 +321,11 @@ class _Period:
             raise RuntimeError(f"GMRES: no convergence to {self._tolerance:g} in {count} iterations")
         coefficients = scipy.fft.fft2(self._polarised(field.reshape(shape).astype(self._dtype)), norm="forward")
         _, at_0, at_top = self._scattered(coefficients)
-        at_0[polarisation][0, 0] += through
+        at_0[polarisation][0, 0] += down_top * through
         at_top[polarisation][0, 0] += through * up_0
-        return at_top, [t * part for t, part in zip(self._t, at_0, strict=True)], count
+        below = [t * part for t, part in zip(self._t, at_0, strict=True)]
+        below[polarisation][0, 0] -= r * self._from_below
+        return at_top, below, count
 
 
 def _dot(vector: tuple, field: Complex) -> Complex:
