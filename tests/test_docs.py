@@ -9,6 +9,7 @@ import re
 import runpy
 import shlex
 import shutil
+from functools import partial
 from pathlib import Path
 
 import mitsuba as mi
@@ -155,7 +156,9 @@ def run_xml(text):
     [pytest.param(page, marks=pytest.mark.slow if page.stem in SLOW else ()) for page in PAGES],
     ids=[page.stem for page in PAGES],
 )
-def test_the_code_of_a_page_runs(page, folder, command, llvm, capfd):
+def test_the_code_of_a_page_runs(page, folder, command, llvm, capfd, monkeypatch):
+    if page.stem == "README":
+        monkeypatch.setattr(md, "example_scene", partial(md.example_scene, size=16))
     names = {}
     parts = list(blocks(page))
     for (language, text), (following, shown) in zip(parts, [*parts, ("", "")][1:], strict=True):

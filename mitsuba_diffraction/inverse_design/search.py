@@ -25,7 +25,7 @@ from .target import is_coloured, wanted_fractions, with_unused
 
 WHITE = 1e3 / np.linspace(1e3 / 430, 1e3 / 670, 8)  # nm, equidistant in 1/λ
 _COARSE, _FINE = 3, 6  # pixels along a texel: of the first searches, and of the last
-_FIRST_ITERATIONS, _LAST_ITERATIONS = 75, 400
+FIRST_ITERATIONS, LAST_ITERATIONS = 75, 400
 _FIXED_FRACTIONS = (0.4, 0.7, 0.9, 1.0)  # of the texels, that are set to levels one round after the other
 _LOSSES_PER_ITERATION = 1.1
 _TIMED_LOSSES = 2  # for the estimate of the time
@@ -175,7 +175,7 @@ class _Search:
     ) -> None:
         self._expect = expect
         self._plate, self._wanted, self._starts = plate, wanted, starts
-        self._progress, self._done, self._total = progress, 0, starts * 2 * _FIRST_ITERATIONS + _LAST_ITERATIONS
+        self._progress, self._done, self._total = progress, 0, starts * 2 * FIRST_ITERATIONS + LAST_ITERATIONS
         # Loss and heights of the best relief of each start.
         self._found: list[tuple[float, Real]] = []
 
@@ -192,20 +192,20 @@ class _Search:
             for scale, per_texel in ((0.5, _COARSE), (1.0, _COARSE), (1.0, _FINE))
         )
         coarse, exact = (_seconds(far_field, self.heights) for far_field in (own, fine))
-        losses = self._starts * 2 * _FIRST_ITERATIONS * coarse + _LAST_ITERATIONS * exact
+        losses = self._starts * 2 * FIRST_ITERATIONS * coarse + LAST_ITERATIONS * exact
         self._expect(_LOSSES_PER_ITERATION * losses, memory_of_prediction(self._plate))
         random = np.random.default_rng(seed)
         for _ in range(self._starts):
-            heights = self._minimised(wide, self._random_relief(random), _FIRST_ITERATIONS)
-            self._minimised(own, heights, _FIRST_ITERATIONS)
+            heights = self._minimised(wide, self._random_relief(random), FIRST_ITERATIONS)
+            self._minimised(own, heights, FIRST_ITERATIONS)
         heights = self.heights
         self._found = [(math.inf, heights)]  # losses of another number of pixels cannot be compared
         if self._plate.levels is None:
-            self._minimised(fine, heights, _LAST_ITERATIONS)
+            self._minimised(fine, heights, LAST_ITERATIONS)
             return
         fixed = np.zeros(heights.shape, bool)
         for fraction in _FIXED_FRACTIONS:
-            heights = self._minimised(fine, heights, _LAST_ITERATIONS // len(_FIXED_FRACTIONS), fixed)
+            heights = self._minimised(fine, heights, LAST_ITERATIONS // len(_FIXED_FRACTIONS), fixed)
             nearest = nearest_levels(heights, self._plate.height_range, self._plate.levels)
             distance = np.abs(nearest - heights)
             fixed = distance <= np.quantile(distance, fraction)

@@ -574,9 +574,9 @@ def test_the_albedo_of_samples_is_at_most_one(wi, wavelength, relief):
     assert r + t <= 1.02 + 3 * error
 
 
-@pytest.mark.parametrize("eta", [1.0, 0.0, -1.5, np.nan])
-def test_an_invalid_index_is_refused(eta):
+def test_an_invalid_index_is_refused():
     parameters = mi.traverse(transmitting("interface", conserve_energy=False))
-    parameters["eta"] = mi.Float(eta)
-    with pytest.raises(ValueError, match="eta: got"):
-        parameters.update()
+    for eta in (1.0, 0.0, -1.5, np.nan):
+        parameters["eta"] = mi.Float(eta)
+        with pytest.raises(ValueError, match="eta: got"):
+            parameters.update()

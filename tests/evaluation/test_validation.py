@@ -262,6 +262,7 @@ def test_equal_profiles_are_solved_once(monkeypatch):
     assert len(solved) == 9
 
 
+@pytest.mark.few(2)
 @pytest.mark.parametrize("scale", [0.5, 20.0])
 @pytest.mark.parametrize("surface", [md.gratings.crossed(1.6, 0.3, samples=32), md.gratings.blazed(2.5, 0.25)])
 def test_the_error_depends_on_lengths_in_wavelengths(surface, scale):

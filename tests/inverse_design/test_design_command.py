@@ -11,6 +11,7 @@ import mitsuba_diffraction as md
 from mitsuba_diffraction import cli
 from mitsuba_diffraction.files.outputs import check_outputs
 from mitsuba_diffraction.files.picture_file import read_picture
+from mitsuba_diffraction.inverse_design import search
 from mitsuba_diffraction.inverse_design.target import finest_strokes
 from mitsuba_diffraction.precomputation.recipe import Recipe
 
@@ -54,7 +55,7 @@ def test_a_design_is_written_as_relief_recipe_and_picture(command):
 
 
 @pytest.mark.not_quick
-def test_files_for_makers_are_written(command):
+def test_files_for_makers_are_written(command, few_iterations):
     code, said, _ = command(
         f"design flag.png {OPTIONS} --levels 4 --export stl --export master --export gds -o step.gsf"
     )
@@ -65,13 +66,20 @@ def test_files_for_makers_are_written(command):
     check_outputs([], [("-o", path) for path in Path().glob("step*")])
 
 
-def test_texels_follow_from_the_detail(command):
+@pytest.fixture
+def few_iterations(monkeypatch):
+    """For notes and files of a design that need not be good."""
+    monkeypatch.setattr(search, "FIRST_ITERATIONS", 1)
+    monkeypatch.setattr(search, "LAST_ITERATIONS", 4)
+
+
+def test_texels_follow_from_the_detail(command, few_iterations):
     code, _, error = command("design flag.png --texel 1 --wavelength 532 --starts 1 --detail 4")
     assert code == 0
     assert "note: 11 texels along the period, 0.8 µm deep, angle 17.5°, for strokes of 1/4 of the picture" in error
 
 
-def test_texels_follow_from_the_finest_strokes_of_the_picture(command):
+def test_texels_follow_from_the_finest_strokes_of_the_picture(command, few_iterations):
     bars = np.zeros((240, 240), np.uint8)
     bars[40:200, 30:210:24] = bars[40:200, 31:210:24] = bars[40:200, 32:210:24] = 255  # three pixels wide
     Image.fromarray(bars).save("bars.png")
