@@ -10,7 +10,7 @@ import sys
 import threading
 import time
 import unicodedata
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 
 from rich.console import Console, RenderableType
@@ -155,6 +155,11 @@ def show(*tables: RenderableType, width: int) -> None:
         if index:
             console.print()
         console.print(table)
+
+
+def cells(columns: Mapping[str, str], row: object) -> list[str]:
+    """Format a row as texts; `columns` are titles and format strings such as "{.error:.1e}"."""
+    return [text.format(row) for text in columns.values()]
 
 
 def table(columns: Iterable[str], rows: Iterable[Sequence[str]], texts: int = 1) -> Table:

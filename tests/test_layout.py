@@ -52,8 +52,8 @@ LEVELS = (
     ("viewer",),
     ("registration",),
     ("cli", "__main__"),
-    ("evaluation",),
     ("shader_2014",),
+    ("evaluation",),
 )
 LEVEL_OF = {name: level for level, names in enumerate(LEVELS) for name in names}
 

@@ -49,7 +49,7 @@ class _Command(TyperCommand):
 
 app = typer.Typer()
 # Imported by name, as no module of the product may depend on what judges it.
-_JUDGES = {"evaluation.commands": ("validate",), "shader_2014.command_line": ("compare", "convergence", "benchmark")}
+_JUDGES = {"shader_2014.command_line": ("compare",), "evaluation.commands": ("convergence", "validate", "benchmark")}
 _judging = (
     getattr(importlib.import_module(f"..{folder}.{n}", __name__), n) for folder, names in _JUDGES.items() for n in names
 )

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Sequence
 
 from rich.table import Table
 from rich.text import Text
@@ -13,11 +13,6 @@ from ..files.writing import whole_file
 from .record import Record
 
 RECORD_COLUMNS = ("check", "expected", "found", "difference", "bound", "")
-
-
-def cells(columns: Mapping[str, str], row: object) -> list[str]:
-    """Format a row as texts; `columns` are titles and format strings such as "{.error:.1e}"."""
-    return [text.format(row) for text in columns.values()]
 
 
 def markdown(columns: Sequence[str], rows: Iterable[Sequence[str]], texts: int = 1) -> str:

@@ -2,16 +2,21 @@
 
 from __future__ import annotations
 
+import functools
 import logging
+import operator
 from collections.abc import Iterator
 from contextlib import contextmanager
 
 import mitsuba as mi
 import mitsuba.parser
 import numpy as np
+from numpy.typing import NDArray
 
 from ..bsdf.base import gratings_in
+from ..bsdf.device_tables import on_device
 from ..bsdf.light import cover_light, recorded_wavelengths
+from ..errors import RequestError
 from .parser_state import children_of
 from .scene_light import warn_of_light_from_below
 from .spectral_film import SpectralRange
@@ -60,6 +65,29 @@ def _warn_of_missing_uvs(scene: mi.Scene) -> None:
 def has_uvs(mesh: mi.Shape) -> bool:
     """Return whether a mesh has UVs; Mitsuba 3.10 renames the method."""
     return mesh.has_texcoords() if hasattr(mesh, "has_texcoords") else mesh.has_vertex_texcoords()
+
+
+def shows_gratings(scene: mi.Scene, across: int = 1) -> NDArray[np.bool_]:
+    """Return a mask of the pixels that show a grating, (height, width).
+
+    Args:
+        scene: as loaded.
+        across: each of across² rays of a pixel hits a grating; by default the one through its centre.
+
+    Raises:
+        ValueError: if no pixel does.
+    """
+    sensor = scene.sensors()[0]
+    columns, rows = sensor.film().crop_size()
+    y, x = np.mgrid[: across * rows, : across * columns].reshape(2, -1) + 0.5
+    position = mi.Point2f(on_device(x / (across * columns)), on_device(y / (across * rows)))
+    si = scene.ray_intersect(mi.Ray3f(sensor.sample_ray(0.0, 0.5, position, mi.Point2f(0.5))[0]))
+    shapes = [shape for shape in scene.shapes() if gratings_in(shape.bsdf())]
+    hit = functools.reduce(operator.or_, (si.shape == mi.ShapePtr(shape) for shape in shapes), mi.Bool(False))
+    shown = np.broadcast_to(np.array(hit), x.shape).reshape(rows, across, columns, across).all(axis=(1, 3))
+    if not shown.any():
+        raise RequestError("scene: no pixel shows only a grating, there is nothing to compare")
+    return np.asarray(shown)
 
 
 def unwrap_integrators(state: mi.parser.ParserState) -> None:

@@ -13,7 +13,6 @@ from theories import COLUMNS, compare_theories
 
 import mitsuba_diffraction as md
 from mitsuba_diffraction import gratings
-from mitsuba_diffraction.evaluation import report
 from mitsuba_diffraction.evaluation.benchmark import study
 from mitsuba_diffraction.evaluation.benchmark.accuracy import Exact
 from mitsuba_diffraction.evaluation.benchmark.cases import Case, bundled_cases, scan_case
@@ -21,6 +20,7 @@ from mitsuba_diffraction.evaluation.benchmark.measured import measured_bsdf
 from mitsuba_diffraction.evaluation.benchmark.sampling import measure
 from mitsuba_diffraction.evaluation.benchmark.speed import Rays
 from mitsuba_diffraction.precomputation.requested_surface import RequestedSurface
+from mitsuba_diffraction.progress import cells
 from mitsuba_diffraction.settings import VISIBLE
 from mitsuba_diffraction.spectrum.tables import SliceTable
 
@@ -108,7 +108,7 @@ def test_theories_are_compared_on_one_grating(llvm):
     assert rigorous.max_error >= rigorous.error
     for cost in (scalar, rigorous):
         assert min(cost.build_seconds, cost.megabytes, cost.evaluate_ratio, cost.lobe_ratio, cost.sample_ratio) > 0
-    assert report.cells(COLUMNS, rigorous)[0] == "rigorous"
+    assert cells(COLUMNS, rigorous)[0] == "rigorous"
 
 
 @pytest.mark.slow

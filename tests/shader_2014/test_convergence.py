@@ -9,7 +9,7 @@ from PIL import Image
 from test_comparison import GRATING, SUN, write
 
 import mitsuba_diffraction  # noqa: F401 (settles which LLVM is used before a variant is set)
-from mitsuba_diffraction.shader_2014.comparison.convergence import (
+from mitsuba_diffraction.evaluation.convergence.by_tolerance import (
     Convergence,
     Point,
     convergence,

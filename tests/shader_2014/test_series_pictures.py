@@ -9,9 +9,9 @@ from PIL import Image
 from test_comparison import GRATING, SUN, write
 
 import mitsuba_diffraction  # noqa: F401 (settles which LLVM is used before a variant is set)
+from mitsuba_diffraction.evaluation.convergence.by_terms import study
 from mitsuba_diffraction.render import render
 from mitsuba_diffraction.render.scene_file import SceneFile
-from mitsuba_diffraction.shader_2014.comparison.series import study
 
 REQUESTED = "".join(f'<string name="{name}" value="${name}"/>' for name in ("representation", "terms", "heights_from"))
 ORIGINS = ("mean", "lowest")

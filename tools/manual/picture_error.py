@@ -20,12 +20,13 @@ from matplotlib.figure import Figure
 from matplotlib.ticker import FuncFormatter, LogLocator, NullFormatter
 from numpy.typing import NDArray
 
-from mitsuba_diffraction.evaluation.benchmark.noise import load_for_noise, shows_gratings
+from mitsuba_diffraction.evaluation.benchmark.noise import load_for_noise
 from mitsuba_diffraction.files.outputs import METADATA
 from mitsuba_diffraction.files.writing import examples_folder, whole_file
 from mitsuba_diffraction.optics.color import XYZ_to_linear_sRGB, spectrum_to_XYZ
 from mitsuba_diffraction.progress import progress_bar, say
 from mitsuba_diffraction.render.passes import split
+from mitsuba_diffraction.render.scene import shows_gratings
 from mitsuba_diffraction.render.spectral_film import channel_wavelengths
 from mitsuba_diffraction.render.sums import Accumulation
 from mitsuba_diffraction.render.trace_pass import pass_seed, trace_pass

@@ -18,9 +18,8 @@ import mitsuba as mi  # isort: skip
 import numpy as np
 
 from mitsuba_diffraction.evaluation.benchmark.speed import Rays, seconds
-from mitsuba_diffraction.evaluation.report import cells
 from mitsuba_diffraction.precomputation.spectra import Spectrum, precompute
-from mitsuba_diffraction.progress import Progress, progress_bar, show, silent, table
+from mitsuba_diffraction.progress import Progress, cells, progress_bar, show, silent, table
 from mitsuba_diffraction.rigorous import efficiencies, refractive_index
 from mitsuba_diffraction.rigorous.rigorous_spectrum import RigorousSpectrum
 from mitsuba_diffraction.scalar_theory.closed_form import efficiency_difference, profile_powers, scalar_orders

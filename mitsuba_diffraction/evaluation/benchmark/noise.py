@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import functools
-import operator
 import os
 import tempfile
 import time
@@ -16,13 +14,10 @@ import mitsuba as mi
 import numpy as np
 from numpy.typing import NDArray
 
-from ...bsdf.base import gratings_in
-from ...bsdf.device_tables import on_device
-from ...errors import RequestError
 from ...files.writing import examples_folder
 from ...optics.color import spectrum_to_linear_sRGB
 from ...progress import Progress, silent
-from ...render.scene import instantiated
+from ...render.scene import instantiated, shows_gratings
 from ...render.scene_file import SceneFile
 from ...render.scene_light import draw_wavelengths_of_lights
 from ...render.spectral_film import channel_wavelengths, replace_films
@@ -123,29 +118,6 @@ def measure_noise(
                 found.append(Noise(path.stem, beside, depth, times[0], times[0] / time_of_it, *ratios))
             progress(number, len(cases))
     return found
-
-
-def shows_gratings(scene: mi.Scene, across: int = 1) -> NDArray[np.bool_]:
-    """Return a mask of the pixels that show a grating, (height, width).
-
-    Args:
-        scene: as loaded.
-        across: each of across² rays of a pixel hits a grating; by default the one through its centre.
-
-    Raises:
-        ValueError: if no pixel does.
-    """
-    sensor = scene.sensors()[0]
-    columns, rows = sensor.film().crop_size()
-    y, x = np.mgrid[: across * rows, : across * columns].reshape(2, -1) + 0.5
-    position = mi.Point2f(on_device(x / (across * columns)), on_device(y / (across * rows)))
-    si = scene.ray_intersect(mi.Ray3f(sensor.sample_ray(0.0, 0.5, position, mi.Point2f(0.5))[0]))
-    shapes = [shape for shape in scene.shapes() if gratings_in(shape.bsdf())]
-    hit = functools.reduce(operator.or_, (si.shape == mi.ShapePtr(shape) for shape in shapes), mi.Bool(False))
-    shown = np.broadcast_to(np.array(hit), x.shape).reshape(rows, across, columns, across).all(axis=(1, 3))
-    if not shown.any():
-        raise RequestError("scene: no pixel shows only a grating, there is nothing to compare")
-    return np.asarray(shown)
 
 
 def _alternating(

@@ -15,10 +15,9 @@ from rich.table import Table
 from ...files.outputs import METADATA
 from ...files.writing import whole_file
 from ...precomputation.grating_spectrum import GratingSpectrum
-from ...progress import Progress, silent, table
+from ...progress import Progress, cells, silent, table
 from ...settings import VISIBLE, ScalarSettings
 from ...spectrum.tables import SliceTable
-from .. import report
 from . import sampling
 from .accuracy import Accuracy, Exact
 from .cases import Case
@@ -159,8 +158,8 @@ def _measured(
 def benchmark_tables(results: Sequence[Result], sampled: Sequence[Sampling]) -> list[Table]:
     """Return tables of speed and error, and of sampling, for a terminal."""
     return [
-        table(RESULT_COLUMNS, (report.cells(RESULT_COLUMNS, result) for result in results)),
-        table(sampling.SAMPLING_COLUMNS, (report.cells(sampling.SAMPLING_COLUMNS, row) for row in sampled)),
+        table(RESULT_COLUMNS, (cells(RESULT_COLUMNS, result) for result in results)),
+        table(sampling.SAMPLING_COLUMNS, (cells(sampling.SAMPLING_COLUMNS, row) for row in sampled)),
     ]
 
 

@@ -1,1 +1,1 @@
-"""The commands that judge the product: compare, convergence, validate, benchmark."""
+"""The commands that judge the product: `validate`, `benchmark` and `convergence`."""

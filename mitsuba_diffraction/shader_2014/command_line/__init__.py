@@ -1,1 +1,1 @@
-"""The commands that compare with the shader of 2014: `compare` and `convergence`."""
+"""The command that compares with the shader of 2014: `compare`."""

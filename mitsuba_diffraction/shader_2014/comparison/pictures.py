@@ -17,12 +17,11 @@ from numpy.typing import NDArray
 
 from ...bsdf.device_tables import on_device
 from ...errors import RequestError
-from ...evaluation.benchmark.noise import shows_gratings
 from ...optics.color import spectrum_to_XYZ
 from ...progress import Progress, part, silent
 from ...render import SpectralImage
 from ...render.passes import split
-from ...render.scene import recorded_range
+from ...render.scene import recorded_range, shows_gratings
 from ...render.scene_file import SceneFile
 from ...render.spectral_film import channel_wavelengths
 from ...render.sums import Accumulation, ratio

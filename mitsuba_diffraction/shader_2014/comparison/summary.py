@@ -7,8 +7,7 @@ import dataclasses
 import numpy as np
 from rich.table import Table
 
-from ...evaluation import report
-from ...progress import table
+from ...progress import cells, table
 from ..diffraction_shader import PUBLISHED_BRIGHTNESS
 from .pictures import NO_SHADOWS
 from .quirk_shares import MIN_EFFECT, QuirkShares
@@ -68,7 +67,7 @@ def picture_table(comparison: Comparison) -> Table:
         found, same = comparison.to_path_traced.get(name), comparison.to_same_light.get(name)
         picture = comparison.pictures[name]
         reads = comparison.shader_reads.get(name, comparison.model_reads)
-        differences = ["1", "", "", ""] if found is None else report.cells(_TO_REFERENCE, found)
+        differences = ["1", "", "", ""] if found is None else cells(_TO_REFERENCE, found)
         brightness = "" if picture.brightness is None else f"{picture.brightness:.3g}"
         same_light = "" if same is None else f"{same.mean:.2f}"
         time = float("nan") if found is None else comparison.time_of_error(name)

@@ -10,13 +10,12 @@ import typer
 
 from ...cli.arguments import Define, Overwrite, Variant, check_suffix, parse_numbers, scene_parameters
 from ...errors import RequestError
-from ...evaluation.report import cells
 from ...files import outputs
-from ...progress import progress_bar, show, table, tell
+from ...progress import cells, progress_bar, show, table, tell
 from ...settings import ORIGINS
 
 if TYPE_CHECKING:
-    from ..comparison.series import SeriesStudy
+    from ..convergence.by_terms import SeriesStudy
 
 
 def convergence(
@@ -48,8 +47,8 @@ def convergence(
 
     from ...render.scene_file import SceneFile
     from ...variants import choose_variant
-    from ..comparison import convergence as study
-    from ..comparison import series
+    from ..convergence import by_terms as series
+    from ..convergence import by_tolerance as study
 
     parameters = scene_parameters(define)
     if terms is None:
@@ -102,8 +101,8 @@ def convergence(
 
 
 def _report_series(found: SeriesStudy, plot: Path, json: Path | None) -> None:
-    from ...evaluation.plots import save_png
-    from ..comparison import series
+    from ..convergence import by_terms as series
+    from ..plots import save_png
 
     save_png(series.plot_series(found), plot)
     if json is not None:

@@ -11,7 +11,7 @@ from ...cli.arguments import KEYS_OF_RECIPES, SURFACE, Overwrite, Variant, check
 from ...errors import RequestError
 from ...files import outputs
 from ...precomputation.requested_surface import RequestedSurface
-from ...progress import progress_bar, show, table
+from ...progress import cells, progress_bar, show, table
 
 
 def benchmark(
@@ -35,12 +35,12 @@ def benchmark(
     """Measure error and speed of the tables, relative to Mitsuba's roughconductor."""
     import mitsuba as mi
 
-    from ...evaluation.benchmark.cases import bundled_cases, scan_case
-    from ...evaluation.benchmark.sampling import measure
-    from ...evaluation.benchmark.speed import machine
-    from ...evaluation.benchmark.study import TOLERANCES, benchmark_tables, run_benchmark, save_speed_plot
     from ...variants import choose_variant
-    from ..shader_speed import shader_speeds, speed_table
+    from ..benchmark.cases import bundled_cases, scan_case
+    from ..benchmark.sampling import measure
+    from ..benchmark.shader_speed import shader_speeds, speed_table
+    from ..benchmark.speed import machine
+    from ..benchmark.study import TOLERANCES, benchmark_tables, run_benchmark, save_speed_plot
 
     if plot is not None:
         check_suffix("--plot", plot, ".png")
@@ -87,10 +87,10 @@ def benchmark(
 
 
 def _measure_terms(json: Path | None, plot: Path | None) -> None:
-    from ...evaluation.benchmark.cases import TIMED_TILES, tiles
-    from ...evaluation.benchmark.speed import machine
-    from ...evaluation.plots import save_png
-    from .. import terms
+    from ..benchmark import terms
+    from ..benchmark.cases import TIMED_TILES, tiles
+    from ..benchmark.speed import machine
+    from ..plots import save_png
 
     with progress_bar("number of terms") as progress:
         found = terms.measure_terms(tiles(), TIMED_TILES, progress=progress)
@@ -102,12 +102,11 @@ def _measure_terms(json: Path | None, plot: Path | None) -> None:
 
 
 def _measure_noise(json: Path | None) -> None:
-    from ...evaluation import report
-    from ...evaluation.benchmark.noise import NOISE_COLUMNS, measure_noise
-    from ...evaluation.benchmark.speed import machine
+    from ..benchmark.noise import NOISE_COLUMNS, measure_noise
+    from ..benchmark.speed import machine
 
     with progress_bar("noise of pictures") as progress:
         noise = measure_noise(progress=progress)
-    show(table(NOISE_COLUMNS, (report.cells(NOISE_COLUMNS, row) for row in noise)), width=110)
+    show(table(NOISE_COLUMNS, (cells(NOISE_COLUMNS, row) for row in noise)), width=110)
     if json is not None:
         outputs.save_json({"machine": machine(), "noise": noise}, json)

@@ -5,7 +5,7 @@ from rich.console import Console
 
 from mitsuba_diffraction import gratings
 from mitsuba_diffraction.evaluation.benchmark.cases import Case
-from mitsuba_diffraction.shader_2014.shader_speed import shader_speeds, speed_table
+from mitsuba_diffraction.evaluation.benchmark.shader_speed import shader_speeds, speed_table
 
 BLAZE = Case("blaze", gratings.blazed(2.5, 0.25), "tile", 65.0)
 

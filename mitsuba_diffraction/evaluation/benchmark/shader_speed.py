@@ -10,19 +10,18 @@ import mitsuba as mi
 import numpy as np
 from rich.table import Table
 
-from ..bsdf.testing import vectors
-from ..evaluation.benchmark.accuracy import Exact, patch_difference, patch_directions
-from ..evaluation.benchmark.cases import Case
-from ..evaluation.benchmark.speed import Rays, seconds
-from ..evaluation.report import cells
-from ..optics.color import SRGB_TO_XYZ
-from ..optics.geometry import k_g
-from ..progress import table
-from ..settings import VISIBLE
-from .evaluate import shader_for
-from .quirks import Quirks
-from .shader import Shader
-from .tristimulus import PUBLISHED_R0
+from ...bsdf.testing import vectors
+from ...optics.color import SRGB_TO_XYZ
+from ...optics.geometry import k_g
+from ...progress import cells, table
+from ...settings import VISIBLE
+from ...shader_2014.evaluate import shader_for
+from ...shader_2014.quirks import Quirks
+from ...shader_2014.shader import Shader
+from ...shader_2014.tristimulus import PUBLISHED_R0
+from .accuracy import Exact, patch_difference, patch_directions
+from .cases import Case
+from .speed import Rays, seconds
 
 _SHADERS = (("flss", "as published"), ("flss", "corrected"), ("nmm", "as published"), ("pq", "as published"))
 

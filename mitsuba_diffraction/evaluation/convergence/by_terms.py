@@ -19,20 +19,20 @@ from numpy.typing import NDArray
 
 from ...bsdf.theory import errors_shown
 from ...errors import RequestError
-from ...evaluation.benchmark.noise import shows_gratings
 from ...optics.color import XYZ_to_linear_sRGB, delta_E, into_gamut, on_screen, spectrum_to_XYZ
 from ...precomputation.grating_spectrum import GratingSpectrum
 from ...progress import Progress, no_progress
 from ...render import SpectralImage
 from ...render.passes import split
+from ...render.scene import shows_gratings
 from ...render.scene_file import SceneFile
 from ...render.spectral_film import channel_wavelengths
 from ...render.sums import Accumulation
 from ...render.trace_pass import pass_seed, trace_pass
 from ...settings import ORIGINS, SERIES, ScalarSettings
-from ..surfaces import gratings_of
-from .difference import as_shown, white_luminance
-from .pictures import Picture
+from ...shader_2014.comparison.difference import as_shown, white_luminance
+from ...shader_2014.comparison.pictures import Picture
+from ...shader_2014.surfaces import gratings_of
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure

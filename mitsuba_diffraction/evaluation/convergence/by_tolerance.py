@@ -20,8 +20,8 @@ from ...files.outputs import METADATA
 from ...files.writing import whole_file
 from ...progress import Progress, no_progress
 from ...settings import MIN_TOLERANCE
-from .difference import as_shown, difference, noise, time_of_error, white_luminance
-from .pictures import Picture, Pictures
+from ...shader_2014.comparison.difference import as_shown, difference, noise, time_of_error, white_luminance
+from ...shader_2014.comparison.pictures import Picture, Pictures
 
 PICTURE_TOLERANCES = (1e-1, 1e-2, 1e-3)
 SAMPLE_COUNTS = (1, 4, 16, 64, 256)

@@ -10,9 +10,9 @@ from rich.console import Console
 
 import mitsuba_diffraction as md
 from mitsuba_diffraction import gratings
+from mitsuba_diffraction.evaluation.benchmark import terms
 from mitsuba_diffraction.evaluation.benchmark.cases import MEASURED, TIMED_TILES, Case, tiles
 from mitsuba_diffraction.evaluation.plots import save_png
-from mitsuba_diffraction.shader_2014 import terms
 
 PERIOD, DEPTH = 2.5, 0.375
 SINUSOID = Case("sinusoid", gratings.sinusoidal(PERIOD, DEPTH, samples=64), "tile", 65.0)

@@ -18,20 +18,19 @@ import numpy as np
 import scipy.fft
 from numpy.typing import NDArray
 
-from ..evaluation.benchmark.accuracy import Exact
-from ..evaluation.benchmark.cases import Case
-from ..evaluation.benchmark.speed import Rays, seconds
-from ..evaluation.plots import figure
-from ..evaluation.report import cells
-from ..precomputation.grating_spectrum import GratingSpectrum
-from ..progress import Progress, silent, table
-from ..scalar_theory.reference import order_powers
-from ..settings import ORIGINS, SERIES, VISIBLE
-from ..spectrum.grids import OrderGrid
-from ..spectrum.tables import AmplitudeTable, SliceTable, series_function, series_weights
-from .flss import FLSS
-from .shader import TextureShader
+from ...precomputation.grating_spectrum import GratingSpectrum
+from ...progress import Progress, cells, silent, table
+from ...scalar_theory.reference import order_powers
+from ...settings import ORIGINS, SERIES, VISIBLE
+from ...shader_2014.flss import FLSS
+from ...shader_2014.shader import TextureShader
+from ...spectrum.grids import OrderGrid
+from ...spectrum.tables import AmplitudeTable, SliceTable, series_function, series_weights
+from ..plots import figure
+from .accuracy import Exact
+from .cases import Case
 from .shader_speed import shader_difference, shaders_of, shading
+from .speed import Rays, seconds
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
