@@ -15,7 +15,7 @@ import mitsuba_diffraction as md
 from mitsuba_diffraction.optics.color import delta_E, spectrum_to_XYZ
 from mitsuba_diffraction.render.scene_file import SceneFile
 from mitsuba_diffraction.render.spectral_film import channel_wavelengths, channel_weights
-from mitsuba_diffraction.shader_2014.comparison import compare, figure, summary
+from mitsuba_diffraction.shader_2014.comparison import ComparisonRequest, compare, figure, summary
 from mitsuba_diffraction.shader_2014.comparison.difference import difference, noise, time_of_error, white_luminance
 from mitsuba_diffraction.shader_2014.comparison.pictures import NO_SHADOWS, Pictures, supported_lights
 from mitsuba_diffraction.shader_2014.comparison.quirk_shares import quirk_shares
@@ -387,7 +387,9 @@ def test_compare_writes_pictures_numbers_and_a_figure(command, llvm, folder):
 @pytest.mark.slow
 def test_a_coat_is_noted(llvm, folder):
     write(Path("scene.xml"), base=BASE + '<float name="coat_ior" value="1.5"/>')
-    found = compare("scene.xml", "flss", width=4, spp=1, shading_points=1, shares=False, brightness=1000, pigment=True)
+    small = {"width": 4, "spp": 1, "shading_points": 1}
+    request = ComparisonRequest("scene.xml", "flss", **small, shares=False, brightness=1000, pigment=True)
+    found = compare(request)
     assert found.coated
     for coated in (True, False):
         heads = [line.split(":")[0] for line in summary.notes(replace(found, coated=coated))]
@@ -399,9 +401,8 @@ def test_a_coat_is_noted(llvm, folder):
 @pytest.mark.slow
 def test_several_shaders_are_compared_with_their_options(llvm, folder):
     write(Path("scene.xml"))
-    found = compare(
-        "scene.xml", "gem", others=("flss",), terms=6, window="texel", width=16, spp=2, shading_points=2, shares=False
-    )
+    settings = {"terms": 6, "window": "texel", "width": 16, "spp": 2, "shading_points": 2}
+    found = compare(ComparisonRequest("scene.xml", "gem", ("flss",), **settings, shares=False))
     assert [*found.pictures] == [
         *("path_traced", "same_light", "published", "corrected", "flss_published", "flss_corrected"),
     ]
@@ -424,7 +425,8 @@ def test_several_shaders_are_compared_with_their_options(llvm, folder):
 @pytest.mark.slow
 def test_the_same_seed_gives_the_same_numbers(llvm, folder):
     write(Path("scene.xml"), rfilter="gaussian")
-    found = [compare("scene.xml", "gem", spp=16, seed=1, shares=False) for _ in range(2)]
+    request = ComparisonRequest("scene.xml", "gem", spp=16, seed=1, shares=False)
+    found = [compare(request) for _ in range(2)]
     for first, second in zip(*(one.pictures.values() for one in found), strict=True):
         np.testing.assert_array_equal(first.image.radiance, second.image.radiance)
     numbers = [summary.as_dict(one) for one in found]

@@ -58,8 +58,8 @@ def compare(
 
     from ...render.scene_file import SceneFile
     from ...variants import choose_variant
+    from ..comparison import ComparisonRequest, figure, summary
     from ..comparison import compare as run
-    from ..comparison import figure, summary
     from ..comparison.pictures import supported_lights
     from ..diffraction_shader import checked_brightness
 
@@ -87,11 +87,10 @@ def compare(
     written += [("--json", json)] if json is not None else []
     check_outputs(reads, written, overwrite=overwrite)
     mi.set_variant(choose_variant(variant))
-    start = time.perf_counter()
-    found = run(
+    request = ComparisonRequest(
         scene,
         first,
-        others=others,
+        others,
         terms=terms,
         window=window,
         interpolation=interpolation,
@@ -104,8 +103,9 @@ def compare(
         seed=seed,
         parameters=parameters,
         shares=shares,
-        progress=progress_bar,
     )
+    start = time.perf_counter()
+    found = run(request, progress_bar)
     with ExitStack() as files:  # all of them or none
         for target, picture in images.items():
             found.pictures[picture].image.save(files.enter_context(whole_file(target)))

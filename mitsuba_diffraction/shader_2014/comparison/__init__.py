@@ -1,5 +1,5 @@
 """The path tracer with this project's BSDF against the real-time shader, on one scene."""
 
-from .side_by_side import Comparison, compare
+from .side_by_side import Comparison, ComparisonRequest, compare
 
-__all__ = ["Comparison", "compare"]
+__all__ = ["Comparison", "ComparisonRequest", "compare"]

@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import functools
 import os
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from contextlib import AbstractContextManager
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 
 import mitsuba as mi
@@ -91,30 +91,12 @@ class Comparison:
         return time_of_error(self.to_path_traced[name].mean, seconds, errors)
 
 
-def compare(
-    scene_path: str | os.PathLike[str],
-    shader: str = "flss",
-    *,
-    others: Sequence[str] = (),
-    terms: int | None = None,
-    window: str | None = None,
-    interpolation: str | None = None,
-    brightness: float | None = None,
-    pigment: bool = False,
-    width: int | None = None,
-    height: int | None = None,
-    spp: int = 64,
-    shading_points: int = 4,
-    seed: int = 0,
-    parameters: Mapping[str, str] | None = None,
-    shares: bool = True,
-    shares_side: int = QUIRKS_MAX_SIDE,
-    progress: Callable[[str], AbstractContextManager[Progress]] = no_progress,
-) -> Comparison:
-    """Render a scene with the path tracer and with the shader under the current variant, and compare.
+@dataclass(frozen=True)
+class ComparisonRequest:
+    """A comparison of a scene by the path tracer and by the shader.
 
-    Args:
-        scene_path: an XML scene whose integrator is a path tracer, with a directional or point light.
+    Attributes:
+        scene: an XML scene whose integrator is a path tracer, with a directional or point light.
         shader: one of `VARIANTS`; the effect of its quirks is measured.
         others: further ones.
         terms: number of Taylor terms; default: as published, or, corrected, as many as needed.
@@ -132,82 +114,102 @@ def compare(
         shares: measure the fraction of the difference that is due to each quirk.
         shares_side: the longer side, in pixels, of the pictures for `shares`; limited to the longer side of the
             picture.
+    """
+
+    scene: str | os.PathLike[str]
+    shader: str = "flss"
+    others: Sequence[str] = ()
+    terms: int | None = None
+    window: str | None = None
+    interpolation: str | None = None
+    brightness: float | None = None
+    pigment: bool = False
+    width: int | None = None
+    height: int | None = None
+    spp: int = 64
+    shading_points: int = 4
+    seed: int = 0
+    parameters: Mapping[str, str] = field(default_factory=dict)
+    shares: bool = True
+    shares_side: int = QUIRKS_MAX_SIDE
+
+    def __post_init__(self) -> None:
+        for name in ("spp", "shading_points", "shares_side"):
+            if (count := getattr(self, name)) < 1:
+                raise RequestError(f"{name}: got {count}, wanted a positive number")
+        for kind in self.shaders:  # before a spectrum is computed
+            if kind not in VARIANTS:
+                raise RequestError(f"shader: got {kind!r}, wanted one of {', '.join(VARIANTS)}")
+        for name, value in self.settings.items():
+            if not any(name in parameters_of_variant(kind) for kind in self.shaders):
+                raise RequestError(f"{name}: got {value!r}, which {', '.join(self.shaders)} cannot use")
+
+    @property
+    def shaders(self) -> tuple[str, ...]:
+        """All shaders."""
+        return self.shader, *self.others
+
+    @property
+    def settings(self) -> dict[str, object]:
+        """What is requested of the shaders besides the default."""
+        requested = {name: getattr(self, name) for name in ("terms", "window", "interpolation")}
+        return {name: value for name, value in requested.items() if value is not None}
+
+    def pictures(self, width: int | None, height: int | None) -> Pictures:
+        """Load the scene for pictures of this size in pixels."""
+        return Pictures(
+            self.scene,
+            self.shader,
+            width=width,
+            height=height,
+            seed=self.seed,
+            parameters=self.parameters,
+            settings=self.settings,
+            brightness=self.brightness,
+            pigment=self.pigment,
+        )
+
+
+def compare(
+    request: ComparisonRequest, progress: Callable[[str], AbstractContextManager[Progress]] = no_progress
+) -> Comparison:
+    """Render a scene with the path tracer and with the shader under the current variant, and compare.
+
+    Args:
+        request: what is rendered and measured.
         progress: progress(label) is a context whose value is called with (done, total).
 
     Raises:
         FileNotFoundError: if there is no such scene.
-        ValueError: if the request is wrong, or the shader cannot show the scene.
+        ValueError: if the shader cannot show the scene.
         RuntimeError: if rendering failed.
     """
-    for name, count in (("spp", spp), ("shading_points", shading_points), ("shares_side", shares_side)):
-        if count < 1:
-            raise RequestError(f"{name}: got {count}, wanted a positive number")
-    for kind in (shader, *others):  # before a spectrum is computed
-        if kind not in VARIANTS:
-            raise RequestError(f"shader: got {kind!r}, wanted one of {', '.join(VARIANTS)}")
-    settings = {"terms": terms, "window": window, "interpolation": interpolation}
-    settings = {name: value for name, value in settings.items() if value is not None}
-    for name in settings:
-        if not any(name in parameters_of_variant(kind) for kind in (shader, *others)):
-            raise RequestError(f"{name}: got {settings[name]!r}, which {', '.join((shader, *others))} cannot use")
-    open_scene = functools.partial(
-        Pictures,
-        scene_path,
-        shader,
-        seed=seed,
-        parameters=parameters,
-        settings=settings,
-        brightness=brightness,
-        pigment=pigment,
-    )
-    of = open_scene(width=width, height=height)
-    for other in others:
-        of.use(other)  # refuses a scene that it cannot show
-    of.use(shader)
-    pictures, reads = {}, {}
+    of = request.pictures(request.width, request.height)
+    for kind in (*request.others, request.shader):
+        of.use(kind)  # refuses a scene that it cannot show
     with progress("path tracer") as bar:
-        pictures["path_traced"] = of.path_traced(spp, bar)
-    reference, few_samples = pictures["path_traced"].xyz, []
+        pictures = {"path_traced": of.path_traced(request.spp, bar)}
+    reference = pictures["path_traced"].xyz
     white = white_luminance(reference, of.surface)
-    for count in (count for count in FEW_SAMPLES if count < spp):
-        few = of.path_traced(count, seed=seed + 1)
-        few_samples.append((count, few.seconds, difference(reference, few.xyz, of.surface, white).mean))
+    few_samples = _few_samples(request, of, reference, white)
     with progress("the same light") as bar:
-        pictures["same_light"] = of.same_light(shading_points, spp, bar)
-    for kind in (shader, *others):
-        of.use(kind)
-        for name, quirks in (("published", of.quirks), ("corrected", ())):
-            key = name if kind == shader else f"{kind}_{name}"
-            with progress(f"{kind}, {name}") as bar:
-                pictures[key] = of.shaded(quirks, shading_points, spp, bar)
-            reads[key] = of.shader_reads
-        if kind == shader:
-            truncated_fraction, series_error = of.truncated_fraction, of.series_error
-    same_light, of_quirks = pictures["same_light"].xyz, None
-    if shares:
-        scale = min(1.0, shares_side / max(of.surface.shape))
-        columns, rows = (max(1, round(size * scale)) for size in of.film_size)
-        small = open_scene(width=columns, height=rows)
-        with progress("quirks") as bar:
-            of_quirks = quirk_shares(small, QUIRKS_SAMPLES, QUIRKS_SHADING_POINTS, bar)
+        pictures["same_light"] = of.same_light(request.shading_points, request.spp, bar)
+    reads, truncated_fraction, series_error = _add_shaded(pictures, request, of, progress)
+    to = functools.partial(_differences, pictures, of.surface, white)
     return Comparison(
-        scene=Path(scene_path).name,
-        shader=shader,
-        others=tuple(others),
-        settings=settings,
+        scene=Path(request.scene).name,
+        shader=request.shader,
+        others=tuple(request.others),
+        settings=request.settings,
         variant=mi.variant(),
-        seed=seed,
+        seed=request.seed,
         pictures=pictures,
-        pigment=pigment,
+        pigment=request.pigment,
         surface=of.surface,
         white=white,
-        to_path_traced={
-            name: difference(reference, pictures[name].xyz, of.surface, white)
-            for name in pictures
-            if name != "path_traced"
-        },
-        to_same_light={name: difference(same_light, pictures[name].xyz, of.surface, white) for name in reads},
-        few_samples=tuple(few_samples),
+        to_path_traced=to("path_traced", [name for name in pictures if name != "path_traced"]),
+        to_same_light=to("same_light", reads),
+        few_samples=few_samples,
         noise={name: noise(picture.halves, of.surface, white) for name, picture in pictures.items()},
         shader_reads=reads,
         model_reads=of.model_reads,
@@ -216,5 +218,56 @@ def compare(
         samples=of.has_samples,
         patches=of.patches,
         coated=of.has_coat,
-        shares=of_quirks,
+        shares=_shares(request, of, progress) if request.shares else None,
     )
+
+
+def _differences(
+    pictures: Mapping[str, Picture], surface: NDArray[np.bool_], white: float, reference: str, names: Iterable[str]
+) -> dict[str, Difference]:
+    """Return the differences of pictures from the one called `reference`."""
+    return {name: difference(pictures[reference].xyz, pictures[name].xyz, surface, white) for name in names}
+
+
+def _few_samples(
+    request: ComparisonRequest, of: Pictures, reference: NDArray[np.float64], white: float
+) -> tuple[tuple[int, float, float], ...]:
+    """Return samples, seconds and mean CIEDE2000 of path-traced pictures with fewer samples than requested."""
+    found = []
+    for count in (count for count in FEW_SAMPLES if count < request.spp):
+        few = of.path_traced(count, seed=request.seed + 1)
+        found.append((count, few.seconds, difference(reference, few.xyz, of.surface, white).mean))
+    return tuple(found)
+
+
+def _add_shaded(
+    pictures: dict[str, Picture],
+    request: ComparisonRequest,
+    of: Pictures,
+    progress: Callable[[str], AbstractContextManager[Progress]],
+) -> tuple[dict[str, int], float | None, float | None]:
+    """Add the pictures of the shaders; return reads by picture, and truncated fraction and error of the first shader's.
+
+    The numbers are those of the corrected picture.
+    """
+    reads, found = {}, {}
+    for kind in request.shaders:
+        of.use(kind)
+        for name, quirks in (("published", of.quirks), ("corrected", ())):
+            key = name if kind == request.shader else f"{kind}_{name}"
+            with progress(f"{kind}, {name}") as bar:
+                pictures[key] = of.shaded(quirks, request.shading_points, request.spp, bar)
+            reads[key] = of.shader_reads
+        found[kind] = of.truncated_fraction, of.series_error
+    return reads, *found[request.shader]
+
+
+def _shares(
+    request: ComparisonRequest, of: Pictures, progress: Callable[[str], AbstractContextManager[Progress]]
+) -> QuirkShares:
+    """Return the fractions of the difference due to each quirk, from small pictures."""
+    scale = min(1.0, request.shares_side / max(of.surface.shape))
+    columns, rows = (max(1, round(size * scale)) for size in of.film_size)
+    small = request.pictures(columns, rows)
+    with progress("quirks") as bar:
+        return quirk_shares(small, QUIRKS_SAMPLES, QUIRKS_SHADING_POINTS, bar)
