@@ -9,7 +9,6 @@ from contextlib import suppress
 from pathlib import Path
 
 import numpy as np
-import OpenEXR
 from numpy.typing import NDArray
 from PIL import Image, ImageOps
 
@@ -76,6 +75,8 @@ def check_picture(path: str) -> None:
     if not os.path.isfile(path):
         return
     shape: tuple[int, ...] = ()
+    import OpenEXR
+
     # What cannot be opened is reported by Mitsuba; OpenEXR raises exceptions of many kinds.
     with warnings.catch_warnings(), suppress(Exception):
         warnings.simplefilter("ignore")
