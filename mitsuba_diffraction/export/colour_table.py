@@ -77,10 +77,10 @@ class Viewed:
         s, p = fresnel(np.minimum(cosine, 1.0), self.below.at(wavelength) / self.coat)
         return (s + p) / 2
 
-    def integrated(self, u: Real, w: Real, step: float = 1.0) -> Real:
-        """Return C by summation over the wavelength in steps of nm, (n, 3); u (n, 2), w (n,)."""
+    def integrated(self, u: Real, w: Real) -> Real:
+        """Return C by summation over the wavelength in steps of one nm, (n, 3); u (n, 2), w (n,)."""
         total = np.zeros((len(w), 3))
-        for wavelength, colour in _light(step):
+        for wavelength, colour in _light(1.0):
             kappa = np.minimum(self.height_scale * 2 * np.pi * w / wavelength, self.spectrum.max_kappa)
             value = self.spectrum.evaluate(u / wavelength, kappa) / wavelength**2 * self.reflectance(wavelength, u, w)
             total += value[:, None] * colour

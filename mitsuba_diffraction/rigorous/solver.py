@@ -131,11 +131,6 @@ class Efficiencies:
         return self.reflection.unpolarised
 
     @property
-    def transmitted_unpolarised(self) -> Real:
-        """The efficiencies of `transmitted_orders` for unpolarised light, (k,)."""
-        return self.transmission.unpolarised
-
-    @property
     def imbalance(self) -> float:
         """The larger |R + T − 1| of s and p light; if the material absorbs, the excess of R over one."""
         reflected = _powers(self.amplitudes).sum(axis=0)
