@@ -21,11 +21,11 @@ from ..export.order_table import write_order_table
 from ..export.shader_tables import ShaderTables, shader_recipe
 from ..files.outputs import check_outputs
 from ..precomputation.grating_spectrum import GratingSpectrum
+from ..precomputation.in_scene import in_scene, with_plastic
 from ..precomputation.requested_surface import RequestedSurface
 from ..progress import progress_bar, say, tell
 from ..scalar_theory.validity import scalar_error
 from ..settings import VISIBLE, wavelengths_inside
-from ..viewer.viewed_surface import in_scene, with_plastic
 from .arguments import (
     KEYS_OF_RECIPES,
     SURFACE,

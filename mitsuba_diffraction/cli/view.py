@@ -12,11 +12,12 @@ import typer
 
 from ..files.outputs import check_outputs
 from ..files.writing import whole_file
+from ..precomputation.in_scene import OF_SCENE
 from ..precomputation.requested_surface import RequestedSurface
 from ..precomputation.surface_text import written
 from ..progress import bytes_text, progress_bar, say, tell
 from ..viewer.page import page, reference_picture
-from ..viewer.viewed_surface import OF_SCENE, Surface
+from ..viewer.viewed_surface import Surface
 from .arguments import KEYS_OF_RECIPES, SURFACE, Overwrite, check_suffix
 
 

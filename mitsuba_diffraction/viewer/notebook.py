@@ -9,9 +9,10 @@ from typing import Any
 
 from ..errors import RequestError
 from ..precomputation.grating_spectrum import GratingSpectrum
+from ..precomputation.in_scene import in_scene
 from ..precomputation.recipe import Recipe
 from .page import page
-from .viewed_surface import Surface, in_scene
+from .viewed_surface import Surface
 
 
 class View:

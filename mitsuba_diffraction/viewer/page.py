@@ -18,6 +18,7 @@ from ..files.outputs import MARK
 from ..optics.color import observer
 from ..optics.materials import conductor
 from ..optics.media import DEFAULT_INT_IOR, MediumBelow
+from ..precomputation.in_scene import AIR, DISCS
 from ..settings import FROM_RADIUS, SUN_COHERENCE_LENGTH, VISIBLE
 from ..spectrum.grids import OrderGrid
 from ..spectrum.sample import effective_coherence_length, window_axes
@@ -25,7 +26,7 @@ from ..spectrum.tables import HALF_SCALE, SliceTable
 from ..surface.heightfield import HeightField
 from .arrays import encoded
 from .coil import coil
-from .viewed_surface import AIR, DISCS, Surface
+from .viewed_surface import Surface
 
 MAX_PAGE_BYTES = 6_000_000  # of a page of one surface
 MAX_HEIGHTS_SIDE = 512  # pixels of the heights for the shader of 2014
