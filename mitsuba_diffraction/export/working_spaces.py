@@ -23,18 +23,20 @@ WORKING_SPACES = MappingProxyType(
     }
 )
 """Matrices from linear sRGB, by Blender's names."""
-_SPREADS = (0.03, 0.1, 0.2)  # standard deviations of the light of an order in a direction, of its mean wavelength
-_MEANS = 60  # of the wavelengths of such mixtures
-_WEIGHT_OF_MIXTURES = 4.0  # relative to that of a bin
-_WEIGHT_OF_WHITE = 1e3
+# Light of an order in a direction, as a lamp of some degrees and the edges of an object leave it, nm.
+_BANDS = (20.0, 40.0, 60.0, 80.0, 120.0, 160.0, 220.0)  # full widths
+_STEPS = (20.0, 50.0, 100.0, 150.0)
+_CENTRES = 25  # of bands and steps
+_WEIGHT_OF_BIN = 0.6  # of a mixture: 1
+_WEIGHT_OF_LUMINANCE = 2.0
+_WEIGHT_OF_WHITE = 10.0
 
 
 def nonnegative_colours(edges: Real, colours: Real) -> Real:
     """Return non-negative colours of bins in each of `WORKING_SPACES`, (spaces, n, 3), of which the mean is white.
 
-    Light of one wavelength lies outside of a working space, and what a display shows is a mixture of neighbouring ones.
-    These colours minimise the squared error of the XYZ of such mixtures, and of the bins themselves, without which a
-    few bins would have all of the light and a picture would be noisy.
+    Light of one wavelength lies outside of a working space, but most mixtures that an order shows lie inside. These
+    colours minimise the squared error of XYZ, relative to the luminance, of such mixtures and of the bins themselves.
 
     Args:
         edges: of the bins, µm, (n + 1,).
@@ -42,20 +44,29 @@ def nonnegative_colours(edges: Real, colours: Real) -> Real:
     """
     from scipy.optimize import nnls
 
-    middle = (edges[1:] + edges[:-1]) / 2
-    means, spreads = (
-        x.ravel() for x in np.meshgrid(np.linspace(middle[0], middle[-1], _MEANS), np.array(_SPREADS), indexing="ij")
-    )
-    mixtures = np.exp(-0.5 * ((middle - means[:, None]) / (spreads * means)[:, None]) ** 2)
-    mixtures *= _WEIGHT_OF_MIXTURES / mixtures.sum(axis=1, keepdims=True)
-    mixtures = np.vstack([np.eye(len(middle)), mixtures])
+    mixtures, weights = _mixtures(edges * 1e3)
+    XYZ = mixtures @ colours @ SRGB_TO_XYZ.T
+    weights = (weights / XYZ[:, 1])[:, None] * np.array([1, np.hypot(1, _WEIGHT_OF_LUMINANCE), 1])
     found = []
     for matrix in WORKING_SPACES.values():
-        to_XYZ = SRGB_TO_XYZ @ np.linalg.inv(matrix)
-        rows = np.einsum("eb,mn->menb", to_XYZ, mixtures).reshape(-1, 3 * len(colours))
-        wanted = rows @ (colours @ matrix.T).ravel()
+        rows = np.einsum("me,eb,mn->menb", weights, SRGB_TO_XYZ @ np.linalg.inv(matrix), mixtures)
         white = np.tile(np.eye(3), len(colours)) * _WEIGHT_OF_WHITE / len(colours)
-        solved, _ = nnls(np.vstack([rows, white]), np.append(wanted, 3 * [_WEIGHT_OF_WHITE]))
-        positive = solved.reshape(-1, 3)
+        equations = np.vstack([rows.reshape(-1, 3 * len(colours)), white])
+        right = np.append((weights * XYZ).ravel(), 3 * [_WEIGHT_OF_WHITE])
+        q, r = np.linalg.qr(equations)
+        positive = nnls(r, q.T @ right, maxiter=100 * len(right))[0].reshape(-1, 3)
         found.append(positive / positive.mean(axis=0))
     return np.stack(found)
+
+
+def _mixtures(edges: Real) -> tuple[Real, Real]:
+    """Return the fraction of each bin in mixtures, (m, n), and their weights, (m,); edges in nm."""
+    wavelengths = edges[:-1, None] + np.diff(edges)[:, None] * (np.arange(8) + 0.5) / 8
+    from_centres = wavelengths - np.linspace(edges[0] + 20, edges[-1] - 30, _CENTRES)[:, None, None]
+    found = [np.exp(-4 * np.log(2) * (from_centres / width) ** 2).mean(axis=2) for width in _BANDS]
+    for width in _STEPS:
+        step = (1 / (1 + np.exp(-3.5 * from_centres / width))).mean(axis=2)
+        found += [step, 1 - step]
+    bins = len(edges) - 1
+    mixtures = np.concatenate([np.eye(bins), *found])
+    return mixtures / bins, np.append(np.full(bins, _WEIGHT_OF_BIN), np.ones(len(mixtures) - bins))

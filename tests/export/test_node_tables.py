@@ -5,7 +5,8 @@ import numpy as np
 import pytest
 from scipy.special import jv
 
-from mitsuba_diffraction.export.working_spaces import WORKING_SPACES
+from mitsuba_diffraction.export.shader_tables import bins_of_wavelengths
+from mitsuba_diffraction.export.working_spaces import WORKING_SPACES, nonnegative_colours
 from mitsuba_diffraction.files.outputs import check_outputs
 
 PERIOD, DEPTH = 1.6, 0.15
@@ -24,17 +25,26 @@ def test_the_tables_of_a_grating_are_its_closed_form(command, tmp_path):
     kappa = np.linspace(0, tables["max_kappa"], tables["powers"].shape[1])
     np.testing.assert_allclose(tables["powers"], jv(order[:, None], kappa * DEPTH / 2) ** 2, atol=2e-3)
     assert list(tables["spaces"]) == list(WORKING_SPACES)
-    for matrix, colours in zip(tables["matrices"], tables["colours"], strict=True):
+    for colours in tables["colours"]:
         assert colours.min() >= 0
         np.testing.assert_allclose(colours.mean(axis=0), 1, atol=1e-5)
-        signed = tables["signed_colours"] @ matrix.T
-        # Mixtures as of an order under a lamp: nearer to the right colour than a cut is.
-        middle = (tables["edges"][1:] + tables["edges"][:-1]) / 2
-        mixtures = np.exp(-0.5 * ((middle - np.linspace(0.45, 0.65, 9)[:, None]) / 0.05) ** 2)
-        cut = np.maximum(signed, 0) / np.maximum(signed, 0).mean(axis=0)
+
+
+def test_mixtures_of_neighbouring_wavelengths_keep_luminance_and_colour():
+    edges, signed = bins_of_wavelengths()
+    middle = (edges[1:] + edges[:-1]) / 2
+    step = np.clip((middle - np.linspace(0.46, 0.6, 15)[:, None]) / 0.15 + 0.5, 0, 1)
+    band = np.clip((0.05 - np.abs(middle - np.linspace(0.44, 0.66, 23)[:, None])) / 0.03 + 0.5, 0, 1)
+    for (space, matrix), colours in zip(WORKING_SPACES.items(), nonnegative_colours(edges, signed), strict=True):
         to_XYZ = np.linalg.inv(matrix).T @ colour.RGB_COLOURSPACES["sRGB"].matrix_RGB_to_XYZ.T
-        errors = [np.linalg.norm(mixtures @ (found - signed) @ to_XYZ) for found in (colours, cut)]
-        assert errors[0] < errors[1]
+        for mixtures, largest, mean in ((np.vstack([step, 1 - step]), 0.12, 0.02), (band, 0.27, 0.08)):
+            wanted, found = (mixtures @ each @ to_XYZ for each in (signed @ matrix.T, colours))
+            errors = np.abs(np.log(found[:, 1] / wanted[:, 1]))
+            assert errors.max() < largest  # a cut at zero: 0.4 to 0.7
+            assert errors.mean() < mean
+            if mixtures is not band and space != "Linear Rec.709":
+                pair = [colour.XYZ_to_Lab(0.4 * each / each[:, 1:2]) for each in (wanted, found)]
+                assert colour.delta_E(*pair, method="CIE 2000").mean() < 1.6
 
 
 @pytest.mark.parametrize(("name", "published"), [("Linear Rec.2020", "ITU-R BT.2020"), ("ACEScg", "ACEScg")])
