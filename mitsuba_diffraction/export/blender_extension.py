@@ -18,6 +18,7 @@ from ..optics.media import MediumBelow
 from ..precomputation.grating_spectrum import GratingSpectrum
 from ..precomputation.requested_surface import RequestedSurface
 from ..progress import Progress, silent
+from .cycles import write_shader
 from .node_tables import write_node_tables
 from .shader_tables import ShaderTables, bins_of_wavelengths, shader_recipe
 
@@ -55,9 +56,11 @@ def write_extension(path: str | os.PathLike[str], progress: Progress = silent) -
                 requested = RequestedSurface.of(",".join(filter(None, [name, aside])), aside=("material",))
                 spectrum = shader_recipe(requested.recipe).cached()
                 assert isinstance(spectrum, GratingSpectrum)
-                file = Path(folder, f"{name}.npz")
-                write_node_tables(ShaderTables.of_spectrum(spectrum, requested.below), file)
-                archive.write(file, f"tables/{name}.npz")
+                tables = ShaderTables.of_spectrum(spectrum, requested.below)
+                for write, suffix in ((write_node_tables, ".npz"), (write_shader, ".osl")):
+                    file = Path(folder, name + suffix)
+                    write(tables, file)
+                    archive.write(file, f"tables/{file.name}")
                 progress(done, len(_SURFACES))
     return f"extension of Blender 4.2 or later, {len(_SURFACES)} surfaces"
 

@@ -23,14 +23,15 @@ def refused(**settings):
 
 
 def mean_of_picture(path):
-    """The mean of a small picture of the open file, its cube under its lamp."""
+    """The mean of the middle of a small picture of the open file, its cube under its lamp and a grey sky."""
     scene = bpy.context.scene
     scene.render.engine, scene.cycles.device, scene.cycles.samples = "CYCLES", "CPU", 16
     scene.render.resolution_x = scene.render.resolution_y = 32
     scene.render.image_settings.file_format, scene.render.filepath = "OPEN_EXR", path
     bpy.ops.render.render(write_still=True)
     pixels = bpy.data.images.load(path).pixels[:]
-    return sum(pixels[::4]) / len(pixels[::4])
+    middle = [pixels[4 * (32 * row + column)] for row in range(13, 19) for column in range(13, 19)]
+    return sum(middle) / len(middle)
 
 
 def is_valid(extension):
@@ -63,11 +64,21 @@ def main(extension, tables, saved):
     settings.surface, settings.medium = "foil", "Au"
     bpy.ops.material.diffraction_create()
     messages = [refused(surface="file", file=other) for other in ("/gone.npz", extension, __file__)]
-    bpy.ops.wm.save_as_mainfile(filepath=saved)
+    settings.surface, settings.medium, settings.coat = "compact_disc", "own", 1.55
+    files = {"coated": f"{saved[:-6]}_coated.blend", "exact": saved}
+    for kind, file in files.items():
+        settings.exact = kind == "exact"
+        bpy.ops.material.diffraction_create()
+        bpy.ops.wm.save_as_mainfile(filepath=file)
+    script = bpy.context.object.active_material.node_tree.nodes["Diffraction"]
+    exact = {"node": script.bl_idname, "bytes": len(script.bytecode), "radial": script.inputs["Radial"].default_value}
     bpy.ops.preferences.addon_disable(module="bl_ext.user_default.diffraction_gratings")
-    bpy.ops.wm.open_mainfile(filepath=saved)
-    mean = mean_of_picture(f"{saved}.exr")
-    print("FOUND", json.dumps({"surfaces": found, "messages": messages, "mean": mean, "valid": is_valid(extension)}))
+    means = {}
+    for kind, file in files.items():
+        bpy.ops.wm.open_mainfile(filepath=file)
+        means[kind] = mean_of_picture(f"{file}.exr")
+    valid = is_valid(extension)
+    print("FOUND", json.dumps(dict(surfaces=found, messages=messages, means=means, exact=exact, valid=valid)))
 
 
 if __name__ == "__main__":

@@ -8,7 +8,7 @@ from typing import Any
 import bpy
 import numpy as np
 
-from . import line_gratings, nodes
+from . import line_gratings, nodes, scripts
 
 _TABLES = os.path.join(os.path.dirname(__file__), "tables")
 _READY = {
@@ -18,6 +18,8 @@ _READY = {
     "xenopeltis": "Skin of Xenopeltis",
     "elaphe": "Skin of Elaphe",
 }
+_STAR = "star"
+_FURTHER = {_STAR: "Holographic star", **line_gratings.PROFILES}
 _FILE = "file"
 _MEDIA = {"own": "Its own", "Al": "Aluminium", "Ag": "Silver", "Au": "Gold", "Cu": "Copper", "index": "Glass, skin"}
 
@@ -30,10 +32,13 @@ class DiffractionSettings(bpy.types.PropertyGroup):
     """What the panel asks for."""
 
     surface: bpy.props.EnumProperty(  # type: ignore[valid-type]
-        name="Surface", items=_items({**_READY, **line_gratings.PROFILES, _FILE: "From a file…"})
+        name="Surface", items=_items({**_READY, **_FURTHER, _FILE: "From a file…"})
     )
     file: bpy.props.StringProperty(  # type: ignore[valid-type]
-        name="File", subtype="FILE_PATH", description="Tables that mitsuba-diffraction export -o NAME.npz wrote"
+        name="File", subtype="FILE_PATH", description="NAME.npz, or NAME.osl, of mitsuba-diffraction export -o"
+    )
+    exact: bpy.props.BoolProperty(  # type: ignore[valid-type]
+        name="Exact Colours (OSL)", description="A script, which Cycles runs on the CPU and OptiX alone"
     )
     medium: bpy.props.EnumProperty(name="Material", items=_items(_MEDIA))  # type: ignore[valid-type]
     index: bpy.props.FloatProperty(  # type: ignore[valid-type]
@@ -45,9 +50,19 @@ class DiffractionSettings(bpy.types.PropertyGroup):
     depth: bpy.props.FloatProperty(  # type: ignore[valid-type]
         name="Depth (µm)", default=0.15, min=0.0, max=2.0, precision=3
     )
+    coat: bpy.props.FloatProperty(  # type: ignore[valid-type]
+        name="Coat Index", default=1.0, min=1.0, max=2.5, precision=3, description="Of a clear layer over it; 1 is none"
+    )
     duty: bpy.props.FloatProperty(  # type: ignore[valid-type]
         name="Duty", default=0.5, min=0.01, max=0.99, description="Width of the ridges relative to the period"
     )
+
+    @property
+    def script(self) -> str | None:
+        """The file of the OSL shader, if there is one and it is wanted."""
+        if self.surface == _FILE:
+            return bpy.path.abspath(self.file) if self.file.endswith(".osl") else None
+        return os.path.join(_TABLES, f"{self.surface}.osl") if self.exact and self.surface in _READY else None
 
     def tables(self) -> dict[str, np.ndarray]:
         """Return the tables of the surface.
@@ -57,15 +72,17 @@ class DiffractionSettings(bpy.types.PropertyGroup):
         """
         if self.surface == _FILE:
             tables = nodes.read_tables(bpy.path.abspath(self.file))
-        elif self.surface in line_gratings.PROFILES:
+        elif self.surface in _FURTHER:
             base = nodes.read_tables(os.path.join(_TABLES, "foil.npz"))
-            tables = line_gratings.line_grating(self.surface, self.period, self.depth, self.duty, base)
+            profile = "sinusoidal" if self.surface == _STAR else self.surface
+            tables = line_gratings.line_grating(profile, self.period, self.depth, self.duty, base)
         else:
             tables = nodes.read_tables(os.path.join(_TABLES, f"{self.surface}.npz"))
         if self.medium == "index":
             tables["index"] = np.full(len(tables["index"]), self.index, np.complex128)
         elif self.medium != "own":
             tables["index"] = np.load(os.path.join(_TABLES, "metals.npz"))[self.medium]
+        tables["coat"] = np.array(self.coat)
         return tables
 
 
@@ -86,13 +103,19 @@ class MATERIAL_OT_diffraction_create(bpy.types.Operator):
         if settings.surface == _FILE:
             name = os.path.splitext(os.path.basename(settings.file))[0]
         try:
-            material, group = nodes.new_material(name, settings.tables())
+            if script := settings.script:
+                material, group = scripts.script_material(name, script)
+                context.scene.cycles.shading_system = True
+            else:
+                material, group = nodes.new_material(name, settings.tables())
         except (OSError, ValueError) as error:
             what = error.strerror if isinstance(error, OSError) and error.strerror else error
             self.report({"ERROR"}, f"{settings.file or name}: {what}")
             return {"CANCELLED"}
         if settings.surface in ("compact_disc", "dvd"):
-            group.inputs["Radial"].default_value = True
+            group.inputs["Radial"].default_value = True if script is None else 1
+        if settings.surface == _STAR:
+            nodes.add_star(material.node_tree, group)
         if getattr(context.object.data, "uv_layers", None):
             tangent = material.node_tree.nodes.new("ShaderNodeTangent")
             tangent.direction_type = "UV_MAP"
@@ -123,14 +146,18 @@ class MATERIAL_PT_diffraction(bpy.types.Panel):
         layout.prop(settings, "surface")
         if settings.surface == _FILE:
             layout.prop(settings, "file")
-        elif settings.surface in line_gratings.PROFILES:
+        elif settings.surface in _FURTHER:
             layout.prop(settings, "period")
             layout.prop(settings, "depth")
             if settings.surface == "lamellar":
                 layout.prop(settings, "duty")
-        layout.prop(settings, "medium")
-        if settings.medium == "index":
-            layout.prop(settings, "index")
+        elif settings.surface in _READY:
+            layout.prop(settings, "exact")
+        if settings.script is None:
+            layout.prop(settings, "medium")
+            if settings.medium == "index":
+                layout.prop(settings, "index")
+            layout.prop(settings, "coat")
         layout.operator(MATERIAL_OT_diffraction_create.bl_idname, icon="MATERIAL")
         material: Any = context.object.active_material
         if material and material.node_tree and (group := material.node_tree.nodes.get("Diffraction")):

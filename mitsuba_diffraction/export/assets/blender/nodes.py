@@ -2,7 +2,8 @@
 
 Each sample draws a wavelength and an order by White Noise of its position, and returns one Glossy lobe about the half
 vector of the direction from which light of that order comes. Needs bpy and NumPy alone; lengths are in µm, frequencies
-in cycles/µm. `tables` are the arrays of `mitsuba-diffraction export SURFACE -o NAME.npz`.
+in cycles/µm. `tables` are the arrays of `mitsuba-diffraction export SURFACE -o NAME.npz`, and may have `coat`, the
+index of a clear layer over the relief.
 """
 
 from __future__ import annotations
@@ -17,8 +18,9 @@ _FORMAT = 1  # of the tables
 _SLOTS = 4096  # of orders, each with as many as is its probability
 _COSINES = 64  # of the reflectance
 _AZIMUTHS, _ALBEDO_COSINES = 25, 16
+_SECTORS, _RINGS, _STAR_TURN = 12, 6.0, 5.0  # of a star; turns of the pattern for one around the axis
 
-_INPUTS: tuple[tuple[str, str, Any, tuple[float, float] | None, str], ...] = (
+INPUTS: tuple[tuple[str, str, Any, tuple[float, float] | None, str], ...] = (
     ("HeightScale", "NodeSocketFloat", 1.0, (0.0, 2.0), "Factor of the heights"),
     ("Orientation", "NodeSocketFloat", 0.0, (-360.0, 360.0), "Degrees from the tangent to the x axis of the pattern"),
     ("Radial", "NodeSocketBool", False, None, "The tangent points away from the object's z axis, as on a disc"),
@@ -59,22 +61,41 @@ def new_material(name: str, tables: Mapping[str, np.ndarray]) -> tuple[bpy.types
     """Return a material of these tables, and its group."""
     material = bpy.data.materials.new(name)
     material.use_nodes = True
-    nodes = material.node_tree.nodes
-    nodes.clear()
-    group = nodes.new("ShaderNodeGroup")
+    material.node_tree.nodes.clear()
+    group = material.node_tree.nodes.new("ShaderNodeGroup")
     group.node_tree = node_group(name, tables)
-    group.name = group.label = "Diffraction"
-    group.width = 220
-    output = nodes.new("ShaderNodeOutputMaterial")
+    return finished(material, group)
+
+
+def finished(
+    material: bpy.types.Material, node: bpy.types.ShaderNode
+) -> tuple[bpy.types.Material, bpy.types.ShaderNode]:
+    """Return a material with the output of a node as its surface, and the node."""
+    node.name = node.label = "Diffraction"
+    node.width = 220
+    output = material.node_tree.nodes.new("ShaderNodeOutputMaterial")
     output.location = (320, 0)
-    material.node_tree.links.new(group.outputs["BSDF"], output.inputs["Surface"])
-    return material, group
+    material.node_tree.links.new(node.outputs["BSDF"], output.inputs["Surface"])
+    return material, node
+
+
+def add_star(tree: bpy.types.NodeTree, group: bpy.types.ShaderNode) -> None:
+    """Turn the pattern by sectors around the z axis of the object, as in a holographic star."""
+    add = _Nodes(tree)
+    at = add.components(add.node("ShaderNodeTexCoord").outputs["Object"])
+    turns = add.multiply(add.math("ARCTAN2", at[1], at[0]), _SECTORS / (2 * np.pi))
+    distance = add.math("SQRT", add.add(add.multiply(at[0], at[0]), add.multiply(at[1], at[1])))
+    # Facets of the points of the star, which meet at ridges, and rings between them.
+    within = add.math("ABSOLUTE", add.subtract(add.math("FRACT", turns), 0.5))
+    ring = add.math("FLOOR", add.multiply(distance, _RINGS, add.add(0.6, within)))
+    step = add.add(add.math("FLOOR", turns), add.multiply(ring, 0.5))
+    add.put(group.inputs["Orientation"], add.multiply(step, 360.0 / _SECTORS * _STAR_TURN))
 
 
 def node_group(name: str, tables: Mapping[str, np.ndarray]) -> bpy.types.NodeTree:
     """Return a new group of these tables."""
     tree = bpy.data.node_groups.new(name, "ShaderNodeTree")
-    for label, kind, value, limits, tip in _INPUTS:
+    for label, kind, value, limits, tip in INPUTS:
         socket = tree.interface.new_socket(label, in_out="INPUT", socket_type=kind)
         socket.default_value = value
         socket.description = tip
@@ -201,6 +222,7 @@ class _Grating(_Nodes):
         super().__init__(tree)
         self.name, self.tables = name, tables
         self.orders = "frequencies" in tables
+        self.coat = float(tables.get("coat", 1.0))
         self.dielectric = bool((tables["index"].imag == 0).all() and (tables["index"].real > 0).all())
 
     def image(self, what: str, values: np.ndarray) -> bpy.types.Image:
@@ -243,28 +265,37 @@ class _Grating(_Nodes):
         half = self.normalised(self.sum(to_camera, to_light))
         c_h = self.larger(self.dot(to_camera, half), 1e-3)
 
-        # Its weight: R K G and the power at κ over the probability, which E bounds.
-        w = self.add(c_i, c_o)
+        # Its weight: R K G and the power at κ over the probability, which E bounds; cosines are those in the coat.
+        coat = self.coat
+        true_c_i, true_c_o, c_i, c_o = c_i, c_o, self.inside(c_i), self.inside(c_o)
+        w = self.multiply(self.add(c_i, c_o), coat)
         slices = tables["powers"].shape[1]
         kappa = self.multiply(self.divide(inputs["HeightScale"], wavelength), w, 2 * np.pi / float(tables["max_kappa"]))
         power = self.number(
             self.image("powers", tables["powers"].T), u_power, self.texel(self.smaller(kappa, 1.0), slices)
         )
         square_v = self.add(self.add(self.multiply(step_x, step_x), self.multiply(step_y, step_y)), self.multiply(w, w))
-        k = self.divide(self.multiply(square_v, square_v), self.multiply(4.0, c_i, c_o, w, w))
-        g = self.smaller(self.divide(self.multiply(4.0, w, self.smaller(c_i, c_o)), square_v), 1.0)
-        reflectances = self.image("reflectance", _reflectances(tables["index"]))
-        reflectance = self.number(reflectances, of_light, self.texel(c_h, _COSINES))
+        k = self.divide(self.multiply(square_v, square_v), self.multiply(4.0 * coat**2, c_i, c_o, w, w))
+        g = self.smaller(self.divide(self.multiply(4.0 * coat, w, self.smaller(c_i, c_o)), square_v), 1.0)
+        index = tables["index"] / coat
+        reflectances = self.image("reflectance", _reflectances(index))
+        at_facet = self.smaller(self.multiply(self.math("SQRT", square_v), 0.5 / coat), 1.0)
+        reflectance = self.number(reflectances, of_light, self.texel(at_facet, _COSINES))
         albedos = self.albedos()
         azimuth = self.math("MULTIPLY_ADD", self.math("ARCTAN2", v_o, u_o), 0.5 / np.pi, 0.5)
         albedo = self.number(
             self.image("albedo", albedos), self.texel(c_o, albedos.shape[1]), self.texel(azimuth, albedos.shape[0])
         )
         weight = self.divide(self.multiply(power, chance, k, g, reflectance, propagates), self.larger(albedo, 1.0))
+        if coat > 1:
+            faces = self.image("coat", _reflectances(np.full(2, coat)))
+            at_front, at_back = (self.number(faces, 0.5, self.texel(c, _COSINES)) for c in (true_c_o, true_c_i))
+            entering = self.subtract(1.0, at_front)
+            weight = self.multiply(weight, entering, self.subtract(1.0, at_back))
 
         # The lobe: slopes of facets along the difference of the directions and across, or along x and y of a cell.
         slope = self.multiply(inputs["Roughness"], wavelength, float(np.sqrt(0.5)))
-        alpha_x = self.smaller(self.larger(self.divide(self.multiply(slope, width_x), c_i), 1e-4), 0.7)
+        alpha_x = self.smaller(self.larger(self.divide(self.multiply(slope, width_x), true_c_i), 1e-4), 0.7)
         alpha_y = self.smaller(self.larger(self.divide(self.multiply(slope, width_y), c_h), 1e-4), 0.7)
         if self.orders:  # at the mirror direction any axis does
             along = self.sum(self.difference(to_light, to_camera), self.scaled(x, 1e-4))
@@ -281,14 +312,31 @@ class _Grating(_Nodes):
         self.put(lobe.inputs["Tangent"], self.normalised(along))
         shaded = lobe.outputs[0]
         if self.dielectric:
-            entering = self.subtract(1.0, self.number(reflectances, of_light, self.texel(c_o, _COSINES)))
-            diffuse, both = self.node("ShaderNodeBsdfDiffuse"), self.node("ShaderNodeAddShader")
-            factor = self.multiply(entering, _entering(tables["index"]))
+            into_base = self.subtract(1.0, self.number(reflectances, of_light, self.texel(c_o, _COSINES)))
+            diffuse = self.node("ShaderNodeBsdfDiffuse")
+            factor = self.multiply(into_base, _entering(index), entering if coat > 1 else 1.0)
             self.put(diffuse.inputs["Color"], self.scaled(inputs["BaseColor"], factor))
-            self.put(both.inputs[0], shaded)
-            self.put(both.inputs[1], diffuse.outputs[0])
-            shaded = both.outputs[0]
+            shaded = self.both(shaded, diffuse)
+        if coat > 1:
+            front = self.node("ShaderNodeBsdfAnisotropic", distribution="GGX")
+            self.put(front.inputs["Color"], self.combined(at_front, at_front, at_front))
+            front.inputs["Roughness"].default_value = 0.0
+            shaded = self.both(shaded, front)
         self.put(self.node("NodeGroupOutput").inputs["BSDF"], shaded)
+
+    def inside(self, cosine: Any) -> Any:
+        """Return the cosine in the coat of a direction of this cosine outside."""
+        if self.coat == 1:
+            return cosine
+        square = self.multiply(cosine, cosine)
+        return self.math("SQRT", self.math("MULTIPLY_ADD", square, 1 / self.coat**2, 1 - 1 / self.coat**2))
+
+    def both(self, shaded: Any, other: Any) -> Any:
+        """Return the sum of a shader and that of a node."""
+        node = self.node("ShaderNodeAddShader")
+        self.put(node.inputs[0], shaded)
+        self.put(node.inputs[1], other.outputs[0])
+        return node.outputs[0]
 
     def space(self) -> int:
         names = list(map(str, self.tables["spaces"]))
@@ -373,7 +421,8 @@ def _slots(tables: Mapping[str, np.ndarray]) -> np.ndarray:
 
 
 def _albedos_of_orders(tables: Mapping[str, np.ndarray]) -> np.ndarray:
-    q, powers, wavelengths = tables["frequencies"], tables["powers"], _middle(tables)[::4, None]
+    q, powers = tables["frequencies"], tables["powers"]
+    wavelengths = _middle(tables)[::4, None] / float(tables.get("coat", 1.0))
     slices = powers.shape[1]
     albedo = np.zeros((_AZIMUTHS, _ALBEDO_COSINES))
     for j, i in np.ndindex(albedo.shape):
