@@ -386,9 +386,16 @@ def test_plugins_are_registered_whenever_the_package_is_imported(lines):
     assert printed == ["DiffractionGrating"]
 
 
-def test_a_recipe_is_read_without_scipys_interpolation():
+def test_recipes_and_the_error_of_their_surfaces_need_no_interpolation_of_scipy():
     """Which takes longer to import than most other modules together, and few surfaces need it."""
-    program = "import sys\nimport mitsuba_diffraction.precomputation.recipe\nprint('scipy.interpolate' in sys.modules)"
+    program = """
+import sys
+import mitsuba_diffraction.precomputation.recipe
+from mitsuba_diffraction.scalar_theory.validity import expected_error
+
+expected_error(2.0, 0.1, 0.5)
+print("scipy.interpolate" in sys.modules)
+"""
     assert in_a_fresh_process(program) == ["False"]
 
 

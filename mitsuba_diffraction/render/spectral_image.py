@@ -18,6 +18,7 @@ from ..errors import RequestError
 from ..files.outputs import MARK, png_text
 from ..files.reading import check_file
 from ..files.writing import encoded_file, whole_file
+from ..machine import usable_cores
 from ..optics.color import (
     ViewTransform,
     XYZ_to_linear_sRGB,
@@ -178,6 +179,8 @@ class SpectralImage:
         header["channels"] = dict.fromkeys(names, pixel)
         # Wavelets compress noise better than ZIP.
         header["compression"] = Imath.Compression(Imath.Compression.PIZ_COMPRESSION)
+        # Otherwise one thread compresses all pixels.
+        OpenEXR.set_global_thread_count(usable_cores())
         # The only writer of OpenEXR that takes a file in blocks of rows.
         with whole_file(path) as temporary:
             with closing(OpenEXR.OutputFile(str(temporary), header)) as file:

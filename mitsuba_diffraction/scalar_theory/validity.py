@@ -11,7 +11,7 @@ import json
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
@@ -25,10 +25,6 @@ from ..settings import VISIBLE
 from ..surface.heightfield import HeightField
 from ..surface.periods import height_spectrum
 from .closed_form import efficiency_difference, profile_powers, scalar_orders, transmitted_orders
-
-if TYPE_CHECKING:
-    from scipy.interpolate import RegularGridInterpolator
-
 
 MAP = Path(__file__).parents[1] / "data" / "scalar_error.json"
 
@@ -73,13 +69,12 @@ def error_map(material: str = "dielectric") -> tuple[Real, Real, Real, Real]:
 
 
 @functools.cache
-def _interpolated(material: str, largest_angle: float, mean: bool) -> RegularGridInterpolator:
-    from scipy.interpolate import RegularGridInterpolator
-
+def _logarithms(material: str, largest_angle: float, mean: bool) -> tuple[Real, Real, Real]:
+    """Return ln(period/λ) (n,), ln(depth/λ) (k,), and the logarithm of the error over directions, (k, n)."""
     periods, depths, directions, errors = error_map(material)
     errors = errors[..., directions[:, 0] <= largest_angle]
     error = errors.mean(axis=2) if mean else errors.max(axis=2)
-    return RegularGridInterpolator((np.log(periods), np.log(depths)), np.log(np.maximum(error, 1e-6)))
+    return np.log(periods), np.log(depths), np.log(np.maximum(error.T, 1e-6))
 
 
 def expected_error(
@@ -123,8 +118,10 @@ def expected_error(
     periods, depths, _, _ = error_map(material)
     if period < periods[0] * wavelength or depth > depths[-1] * wavelength:
         return float("nan")
-    point = np.minimum(period / wavelength, periods[-1]), np.maximum(depth / wavelength, depths[0])
-    return float(np.exp(_interpolated(material, float(largest_angle), mean)(np.log(point))).item())
+    # Outside, `np.interp` takes the value at the boundary.
+    at, across, errors = _logarithms(material, float(largest_angle), mean)
+    of_depths = [np.interp(np.log(period / wavelength), at, error) for error in errors]
+    return float(np.exp(np.interp(np.log(max(depth / wavelength, depths[0])), across, of_depths)))
 
 
 @dataclass(frozen=True)

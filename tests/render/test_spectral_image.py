@@ -30,6 +30,19 @@ def test_a_saved_image_is_loaded_unchanged(image, tmp_path):
     assert [path.name for path in tmp_path.iterdir()] == ["a.exr"]
 
 
+def test_threads_compress_the_same_file(image, tmp_path, monkeypatch):
+    before, files = OpenEXR.global_thread_count(), []
+    try:
+        for cores in (1, 3):
+            monkeypatch.setattr(spectral_image, "usable_cores", lambda cores=cores: cores)
+            image.save(tmp_path / "picture.exr")
+            files.append((tmp_path / "picture.exr").read_bytes())
+            assert OpenEXR.global_thread_count() == cores
+    finally:
+        OpenEXR.set_global_thread_count(before)
+    assert files[0] == files[1]
+
+
 def test_fractional_wavelengths_are_loaded_unchanged(tmp_path):
     image = SpectralImage([404.5, 412.25], np.ones((1, 1, 2)))
     image.save(tmp_path / "a.exr")
