@@ -11,7 +11,7 @@ import mitsuba as mi
 import numpy as np
 
 from ..errors import RequestError, is_number
-from ..files.picture_file import check_picture
+from ..files.picture_file import IN_TEXTURE, check_picture
 from .base import nested_plugin
 
 
@@ -95,7 +95,7 @@ def numbers_from(name: str, file: str, white: float = 1.0, others: str = "") -> 
         RequestError: if it is not a picture, or larger than `check_picture` allows.
     """
     path = str(mi.file_resolver().resolve(file))
-    check_picture(path)
+    check_picture(path, IN_TEXTURE)
     try:
         bitmap = mi.Bitmap(path)
     except RuntimeError:

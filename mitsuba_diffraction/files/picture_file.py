@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import math
 import os
+import re
 import warnings
-from contextlib import suppress
 from pathlib import Path
 
 import numpy as np
@@ -13,13 +13,18 @@ from numpy.typing import NDArray
 from PIL import Image, ImageOps
 
 from ..errors import RequestError
-from .reading import BAD_PICTURE, check_array, check_file
+from ..progress import bytes_text
+from .reading import BAD_PICTURE, MAX_FILE_BYTES, check_file
 
 PICTURE_FORMATS = ("PNG", "JPEG", "TIFF", "WEBP", "GIF", "BMP", "PPM")
 """What a picture may be, by Pillow's names; it would run another program for some others, such as EPS."""
 MAX_PICTURE_PIXELS, MAX_LENGTH = 2**26, 2**15  # in all, and along an edge
 MAX_EDGE = 2048  # pixels; a larger picture is reduced
 _PIXELS_PER_STRIP = 2**21
+IN_TEXTURE, IN_ENVIRONMENT = 10, 26  # bytes of memory for a number of a picture that Mitsuba 3.9.1 loads, measured
+_SMALL_FILE, _MAX_MEMORY = 10**7, 10**9  # bytes; see `reading`
+_HEADER_BYTES = 2**16
+_OF_PICTURES = b"\x89PNG", b"\xff\xd8", b"BM", b"P6", b"v/1\1"  # first bytes of those that Mitsuba reads
 
 
 def read_picture(path: Path, invert: bool = False) -> NDArray[np.float64]:
@@ -66,28 +71,54 @@ def read_picture(path: Path, invert: bool = False) -> NDArray[np.float64]:
     return np.ascontiguousarray(linear[..., 0]) if is_grey else linear
 
 
-def check_picture(path: str) -> None:
-    """Check the pixels that a picture declares, before Mitsuba reads it; other files are left to it.
+def check_picture(path: str, in_memory: int) -> None:
+    """Check the numbers that a picture declares, before Mitsuba loads it; other files are left to it.
+
+    A .pfm is not compressed, and needs no limit: it takes what its bytes do, times these factors.
+
+    Args:
+        path: the file.
+        in_memory: bytes for a number, `IN_TEXTURE` or `IN_ENVIRONMENT`.
 
     Raises:
-        RequestError: if its numbers in float32 are more than `check_array` allows.
+        RequestError: if a file of less than 10 MB would take more than 1 GB, a larger one more than `MAX_FILE_BYTES` as
+            numbers in float32, or its header cannot be read.
     """
     if not os.path.isfile(path):
         return
-    shape: tuple[int, ...] = ()
+    count, stored = _declared_numbers(path), os.path.getsize(path)
+    limit = _MAX_MEMORY // in_memory if stored < _SMALL_FILE else MAX_FILE_BYTES // 4
+    if count > limit:
+        raise RequestError(
+            f"{path}: got a picture of {count} numbers in {bytes_text(stored)}, wanted at most {limit}: make it smaller"
+        )
+
+
+def _declared_numbers(path: str) -> int:
+    """Return how many numbers a picture has by its header, 0 of what is none."""
+    with open(path, "rb") as stream:
+        start = stream.read(_HEADER_BYTES)
+    if start.startswith(b"#?"):
+        if not (sizes := re.findall(rb"[-+][XY]\s+(\d+)\s+[-+][XY]\s+(\d+)", start)):
+            raise RequestError(f"{path}: got a picture of Radiance without its size, wanted one as -Y 512 +X 1024")
+        return max(3 * int(rows) * int(columns) for rows, columns in sizes)
     import OpenEXR
 
-    # What cannot be opened is reported by Mitsuba; OpenEXR raises exceptions of many kinds.
-    with warnings.catch_warnings(), suppress(Exception):
+    with warnings.catch_warnings():
         warnings.simplefilter("ignore")
-        if OpenEXR.isOpenExrFile(path):
-            header = OpenEXR.File(path, header_only=True).header()
-            low, high = header["dataWindow"]
-            shape = *(int(n) for n in high - low + 1), len(header["channels"])
-        else:
+        try:
+            if OpenEXR.isOpenExrFile(path):
+                header = OpenEXR.File(path, header_only=True).header()
+                low, high = header["dataWindow"]
+                return math.prod(int(n) for n in high - low + 1) * len(header["channels"])
             with Image.open(path, formats=(*PICTURE_FORMATS, "TGA")) as image:
-                shape = *image.size, len(image.getbands())
-    check_array(shape, os.path.getsize(path), 4)
+                return image.width * image.height * len(image.getbands())
+        except Image.DecompressionBombError:  # raised above twice as many pixels, before their number is known
+            return MAX_FILE_BYTES
+        except Exception as error:  # OpenEXR raises exceptions of many kinds
+            if start.startswith(_OF_PICTURES):
+                raise RequestError(f"{path}: not a picture that can be read ({error})") from None
+            return 0  # what is no picture is refused by Mitsuba
 
 
 def _strips(height: int, rows: int) -> list[tuple[int, int]]:

@@ -22,6 +22,7 @@ import mitsuba.parser
 import numpy as np
 
 from ..errors import RequestError, did_you_mean, root_cause
+from ..files.picture_file import IN_ENVIRONMENT, IN_TEXTURE, check_picture
 from ..files.writing import examples_folder, refuse_other_than_utf8, whole_file
 from ..precomputation.recipe import Recipe, source_named
 from ..progress import progress_bar
@@ -35,6 +36,7 @@ from .scene_numbers import read_numbers
 from .spectral_film import replace_films
 
 _PLUGINS = ("diffraction_grating", "diffraction_path", "diffraction_shader")
+_PICTURES = {"bitmap": IN_TEXTURE, "envmap": IN_ENVIRONMENT}  # plugins that read one
 _FORMATS_WITH_ALPHA = {"luminance_alpha", "rgba", "xyza"}
 
 
@@ -265,7 +267,9 @@ def _parameters_of(scene: Path) -> set[str]:
 
 
 def _refuse_missing_files(path: Path, state: mi.parser.ParserState) -> None:
-    """Raise RequestError if a mesh, texture or named surface is missing, before spectra are computed for the scene.
+    """Raise RequestError if a mesh, picture or named surface is missing, before spectra are computed for the scene.
+
+    Or if a picture is too large (`check_picture`).
 
     Models of the package's scenes are made here, if a comment says how: "… made by: python scenes/disc.py". In other
     cases the message quotes that command.
@@ -278,7 +282,9 @@ def _refuse_missing_files(path: Path, state: mi.parser.ParserState) -> None:
             # If it is a file, the error of the grating lists the available spectra.
             source_named(str(resolved_file(name)))
             continue
-        if resolved_file(name).is_file():
+        if (file := resolved_file(name)).is_file():
+            if (in_memory := _PICTURES.get(node.props.plugin_name())) is not None:
+                check_picture(str(file), in_memory)
             continue
         text = path.read_text(encoding="utf-8", errors="replace")
         made = re.search(r"made by:\s+(python\s+\S+\.py(?:\s+&&\s+python\s+\S+\.py)*)", text)

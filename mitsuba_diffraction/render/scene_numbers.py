@@ -5,7 +5,6 @@ from __future__ import annotations
 import mitsuba as mi
 import mitsuba.parser
 
-from ..files.picture_file import check_picture
 from .parser_state import add_child, children_of, resolved_file
 
 _OF_ANY_NAME = {"bumpmap", "normalmap"}
@@ -41,7 +40,6 @@ def _linear(texture: mi.Properties) -> mi.Properties | None:
     if props.plugin_name() != "bitmap" or props.get("raw", False) or "filename" not in props:
         return None
     path = str(resolved_file(props["filename"]))
-    check_picture(path)
     bitmap = mi.Bitmap(path)
     if bitmap.pixel_format() not in (mi.Bitmap.PixelFormat.RGB, mi.Bitmap.PixelFormat.RGBA):
         return None

@@ -1,7 +1,11 @@
-"""Scenes of strangers: what is nested too deeply for Mitsuba's parser and objects is refused."""
+"""Scenes of strangers: what is too deep for Mitsuba's parser and objects, and too large pictures, are refused."""
 
+import struct
+import zlib
 from pathlib import Path
 
+import numpy as np
+import OpenEXR
 import pytest
 
 from mitsuba_diffraction.errors import RequestError
@@ -74,6 +78,64 @@ def test_parameters_that_multiply_are_refused():
     values = "".join(f'<default name="p{k + 1}" value="{10 * f"$p{k}"}"/>' for k in range(9))
     with pytest.raises(RequestError, match="got a value of more than 65536 characters"):
         parse(f'<scene version="3.0.0"><default name="p0" value="0123456789"/>{values}</scene>')
+
+
+def png(width, height):
+    """A picture of 8 bits and four channels, without its pixels."""
+    header = b"IHDR" + struct.pack(">2I5B", width, height, 8, 6, 0, 0, 0)
+    header = struct.pack(">I", 13) + header + struct.pack(">I", zlib.crc32(header))
+    return b"\x89PNG\r\n\x1a\n" + header + struct.pack(">I", 0) + b"IDAT" + struct.pack(">I", zlib.crc32(b"IDAT"))
+
+
+def hdr(width, height, start=b""):
+    return b"#?RADIANCE\n" + start + b"FORMAT=32-bit_rle_rgbe\n\n-Y %d +X %d\n" % (height, width)
+
+
+def exr(width, height):
+    OpenEXR.File(
+        {"compression": OpenEXR.ZIP_COMPRESSION}, {c: np.zeros((height, width), np.float16) for c in "RGB"}
+    ).write("made.exr")
+    return Path("made.exr").read_bytes()
+
+
+def of_picture(element, name):
+    named = f'<string name="filename" value="{name}"/>'
+    return f'<scene version="3.0.0">{element.format(named)}</scene>'
+
+
+TEXTURE = (
+    '<shape type="sphere"><bsdf type="diffuse"><texture type="bitmap" name="reflectance">{}</texture></bsdf></shape>'
+)
+SKY = '<emitter type="envmap">{}</emitter>'
+PICTURES = {
+    "texture.png": (TEXTURE, lambda: png(8192, 8192), 268435456),
+    "bomb.png": (TEXTURE, lambda: png(60000, 60000), 2147483648),
+    "sky.png": (SKY, lambda: png(4096, 4096), 67108864),
+    "sky.hdr": (SKY, lambda: hdr(6000, 3000), 54000000),
+    "two_sizes.hdr": (SKY, lambda: hdr(6000, 3000, b"# -Y 1 +X 1\n"), 54000000),
+    "without_size.hdr": (SKY, lambda: b"#?RADIANCE\n" + bytes(2**16), "got a picture of Radiance without its size"),
+    "unknown_size.png": (SKY, lambda: png(4096, 4096)[:12], "not a picture that can be read"),
+    "sky.exr": (SKY, lambda: exr(6000, 3000), 54000000),
+}
+
+
+@pytest.mark.parametrize("name", PICTURES)
+def test_pictures_that_fill_the_memory_are_refused_before_mitsuba_loads_them(name):
+    element, make, numbers = PICTURES[name]
+    Path(name).write_bytes(make())
+    message = numbers if isinstance(numbers, str) else f"got a picture of {numbers} numbers in .*B, wanted at most"
+    with pytest.raises(RequestError, match=f"scene.xml: .*{name}: {message}"):
+        parse(of_picture(element, name))
+
+
+@pytest.mark.parametrize(
+    ("element", "content"),
+    [(TEXTURE, png(4096, 4096)), (SKY, hdr(4096, 2048)), (SKY, b"none")],
+    ids=["texture", "sky", "none"],
+)
+def test_pictures_of_usual_size_are_left_to_mitsuba(element, content):
+    Path("a.bin").write_bytes(content)
+    parse(of_picture(element, "a.bin"))
 
 
 def test_other_scenes_are_read():
