@@ -223,6 +223,7 @@ class RigorousSettings(Settings):
         self._check_known("transmission", TRANSMISSIONS)
         super().__post_init__()
         self._check("ext_ior", lambda x: 1 <= x <= 10, "the index of the medium above, from 1 to 10")
+        object.__setattr__(self, "ext_ior", float(self.ext_ior))
         if not isinstance(self.polarised, bool):
             raise RequestError(f"polarised: got {self.polarised!r}, wanted True or False")
         if self.transmission != "none":

@@ -130,13 +130,17 @@ def render(
     from ..render.animation import animations_of, frames_of, save_animation
     from ..render.animation import orbit as motions_of_orbit
     from ..render.cluster import trace_on
+    from ..render.denoise import default_of, is_requested
     from ..render.passes import deferred_interrupt, trace_locally
     from ..render.scene_file import SceneFile
     from ..render.scene_materials import check_materials
     from ..render.sums import checkpoint_path
     from ..variants import choose_variant
 
-    scene_file = SceneFile(scene, scene_parameters(define), materials_of(material), (width, height))
+    parameters = scene_parameters(define)
+    # Mitsuba refuses a parameter that nothing refers to.
+    given = parameters.pop("denoise", None) if scene.is_file() and default_of(scene) else None
+    scene_file = SceneFile(scene, parameters, materials_of(material), (width, height))
     scene_files = [scene_file] if frames is None else frames_of(scene_file, frames)
     if frames is not None and not orbit and scene_files[0] == scene_files[-1]:
         raise RequestError("--frames N: wanted --orbit, or a value that changes, such as -D turn=0:90")
@@ -151,7 +155,7 @@ def render(
         )
     mi.set_variant(choose_variant(variant))
     if denoise is None:
-        denoise = _requests_denoising(scene)
+        denoise = is_requested(scene, given) and _can_denoise()
     named = None if spp else scene_file.sample_count()
     spp = spp or named or 64
     tracer = trace_locally if dask is None else trace_on(dask)
@@ -174,7 +178,7 @@ def render(
         for number, (path, frame, motion) in enumerate(zip(pictures, scene_files, motions, strict=True)):
             begin = time.perf_counter()
             factor = _picture(
-                frame.moved(motion),
+                frame.viewed(motion=motion),
                 path,
                 request,
                 resume=resume,
@@ -229,12 +233,10 @@ def _announce_others(label: str, pictures: int, seconds: float) -> None:
         say(label, f"other pictures ({pictures}): about {time_text(pictures * seconds)}")
 
 
-def _requests_denoising(scene: Path) -> bool:
-    """Return whether a scene requests a denoised preview, and the denoiser is installed."""
-    from ..render.denoise import check_requirements, is_requested
+def _can_denoise() -> bool:
+    """Return whether the denoiser is installed."""
+    from ..render.denoise import check_requirements
 
-    if not is_requested(scene):
-        return False
     with suppress(RequestError):
         check_requirements()
         return True

@@ -82,7 +82,7 @@ def orbit(scene_file: SceneFile, frames: int) -> list[tuple[float, ...]]:
     line of sight that is closest to the centre of the scene's bounding box. Each motion is an affine map of world
     space; the first is the identity. Lamps are outside of the box. For errors see `SceneFile.load`.
     """
-    scene = replace(scene_file, size=(1, 1)).load()
+    scene = scene_file.viewed(size=(1, 1)).load()
     target, up = _view(scene)
     motions = []
     for k in range(frames):

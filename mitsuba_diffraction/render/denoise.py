@@ -47,12 +47,17 @@ class Guides:
     response: NDArray[np.float64]
 
 
-def is_requested(scene: str | os.PathLike[str]) -> bool:
-    """Return whether an XML scene contains `<default name="denoise" value="true"/>`, which Mitsuba ignores."""
+def default_of(scene: str | os.PathLike[str]) -> str | None:
+    """Return the value of `<default name="denoise" value="…"/>` of an XML scene, which Mitsuba ignores, or None."""
     # By regular expressions: Mitsuba reads scenes that XML parsers refuse, such as scenes with "--" in a comment.
     text = re.sub(r"<!--.*?-->", "", Path(scene).read_text(encoding="utf-8", errors="replace"), flags=re.DOTALL)
     tags = (dict(re.findall(r"""(\w+)\s*=\s*["'](.*?)["']""", tag)) for tag in re.findall(r"<default\b([^>]*)>", text))
-    value = {tag.get("name"): tag.get("value") for tag in tags}.get("denoise", "false")
+    return {tag.get("name"): tag.get("value") for tag in tags}.get("denoise")
+
+
+def is_requested(scene: str | os.PathLike[str], given: str | None = None) -> bool:
+    """Return whether a denoised preview is requested by an XML scene, or by a value given for its default."""
+    value = given or default_of(scene) or "false"
     if value not in ("true", "false"):
         raise RequestError(f"{os.fspath(scene)}: denoise: got {value!r}, wanted true or false")
     return value == "true"

@@ -5,7 +5,7 @@ from __future__ import annotations
 import functools
 import logging
 import operator
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 
 import mitsuba as mi
@@ -43,7 +43,7 @@ def instantiated(config: mi.parser.ParserConfig, state: mi.parser.ParserState) -
 
 
 def warn_of_gratings(scene: mi.Scene) -> None:
-    """Log a warning for gratings on meshes without UVs, and for gratings that are black as they are lit from below.
+    """Log a warning for gratings on shapes without UVs, and for gratings that are black as they are lit from below.
 
     Not part of `SceneFile.load`, since workers load the scene of a rendering again.
     """
@@ -52,14 +52,24 @@ def warn_of_gratings(scene: mi.Scene) -> None:
 
 
 def _warn_of_missing_uvs(scene: mi.Scene) -> None:
-    """Log a warning if gratings are on meshes without texture coordinates; named by BSDF, as merged meshes lose ids."""
-    bsdfs = [shape.bsdf() for shape in scene.shapes() if shape.is_mesh() and not has_uvs(shape)]
-    if names := sorted({bsdf.id() or "a BSDF" for bsdf in bsdfs if gratings_in(bsdf)}):
-        _log.warning(
-            "%s: on a mesh without UVs, where the direction of the grating differs from triangle to triangle; "
-            "wanted a mesh with UVs",
-            ", ".join(names),
+    """Log a warning if gratings are on shapes without UVs; named by BSDF, as merged meshes lose ids."""
+    _warn_of_shapes(
+        [shape for shape in scene.shapes() if shape.is_mesh() and not has_uvs(shape)],
+        "on a mesh without UVs, where the direction of the grating differs from triangle to triangle; wanted a mesh "
+        "with UVs",
+    )
+    without = {int(getattr(mi.ShapeType, kind)): kind.lower() for kind in ("LinearCurve", "SDFGrid", "Ellipsoids")}
+    for number, kind in without.items():
+        _warn_of_shapes(
+            [shape for shape in scene.shapes() if shape.shape_type() == number],
+            f"on {kind}, which has no UVs: the direction of the grating is discontinuous; wanted a mesh with UVs",
         )
+
+
+def _warn_of_shapes(shapes: Sequence[mi.Shape], warning: str) -> None:
+    bsdfs = [shape.bsdf() for shape in shapes]
+    if names := sorted({bsdf.id() or "a BSDF" for bsdf in bsdfs if gratings_in(bsdf)}):
+        _log.warning("%s: %s", ", ".join(names), warning)
 
 
 def has_uvs(mesh: mi.Shape) -> bool:

@@ -77,9 +77,9 @@ class SceneFile:
         """Return what is sent to other processes: the fields, not the parsed file."""
         return {item.name: getattr(self, item.name) for item in fields(self)}
 
-    def moved(self, motion: tuple[float, ...] | None) -> SceneFile:
-        """Return the same file with another motion, without parsing it again."""
-        other = replace(self, motion=motion)
+    def viewed(self, **changes: Any) -> SceneFile:
+        """Return the same file with another size or motion, without parsing it again."""
+        other = replace(self, **changes)
         other.__dict__["_content"] = self._content
         return other
 

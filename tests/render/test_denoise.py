@@ -174,6 +174,20 @@ def test_a_value_other_than_true_or_false_is_refused(command, tmp_path, monkeypa
     assert "denoise: got 'yes', wanted true or false" in err
 
 
+@pytest.mark.parametrize(("given", "code"), [("false", 0), ("yes", 2)])
+def test_a_value_given_for_the_default_of_denoise_is_taken(given, code, command, monkeypatch, tmp_path):
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr("mitsuba_diffraction.render.denoise.denoised_picture", lambda *_: pytest.fail("not requested"))
+    Path("scene.xml").write_text(ASKS)
+    found, _, err = command(f"render scene.xml --spp 1 -D denoise={given} --variant llvm_ad_spectral")
+    assert found == code, err
+    assert ("denoise: got 'yes', wanted true or false" in err) == bool(code)
+    Path("scene.xml").write_text(SCENE)  # without this default
+    found, _, err = command("render scene.xml --spp 1 -D denoise=false --variant llvm_ad_spectral")
+    assert found == 2
+    assert "denoise" in err
+
+
 def test_a_requested_denoiser_is_read_as_leniently_as_mitsuba_reads_scenes(tmp_path):
     path = tmp_path / "scene.xml"
     comment = '<!-- python x.py --small; <default name="denoise" value="false"/> -->'

@@ -646,6 +646,16 @@ def test_the_orbit_runs_around_the_target():
         np.testing.assert_allclose(camera(motion), camera(None, "moved.xml"), atol=1e-6)
 
 
+def test_the_orbit_of_a_parsed_scene_does_not_parse_it_again(monkeypatch):
+    file = SceneFile("scene.xml")
+    file.files()
+    monkeypatch.setattr(
+        "mitsuba_diffraction.render.scene_file.check_nesting", lambda *_: pytest.fail("it was parsed again")
+    )
+    assert len(orbit(file, 2)) == 2
+    file.viewed(size=(4, 4)).load()
+
+
 def test_lamps_do_not_displace_the_orbit():
     lamp = '<shape type="sphere"><point name="center" x="3" y="9" z="7"/><emitter type="area"/></shape></scene>'
     Path("scene.xml").write_text(SCENE.replace("RFILTER", "box").replace("</scene>", lamp))

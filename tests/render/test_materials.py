@@ -331,6 +331,28 @@ def test_a_grating_on_a_mesh_without_uvs_is_logged(exported, uvs, caplog):
     assert all(line.startswith("mat-Disc: on a mesh without UVs") for line in messages)
 
 
+@pytest.mark.few(2)
+@pytest.mark.parametrize("kind", ["linearcurve", "sdfgrid", "ellipsoids", "bsplinecurve", "sphere"])
+def test_a_grating_on_a_shape_without_uvs_is_logged(kind, llvm, tmp_path, caplog):
+    filename = tmp_path / "shape"
+    shape = {"type": kind, "bsdf": {"type": "diffraction_grating", "profile": "blazed", "period": 2.5, "depth": 0.25}}
+    shape["bsdf"]["conserve_energy"] = False
+    if kind.endswith("curve"):
+        filename.write_text("-1 0 0 1\n0 0 0 1\n1 0 0 1\n2 0 0 1\n")
+        shape["filename"] = str(filename)
+    elif kind == "ellipsoids":
+        shape |= {"centers": mi.TensorXf(np.zeros((1, 3))), "scales": mi.TensorXf(np.ones((1, 3)))}
+        shape |= {"quaternions": mi.TensorXf(np.array([[0.0, 0, 0, 1]]))}
+    elif kind == "sdfgrid":
+        at = np.mgrid[:8, :8, :8] / 7 - 0.5
+        shape["grid"] = mi.TensorXf(np.sqrt((at**2).sum(0))[..., None] - 0.4)
+    warn_of_gratings(mi.load_dict({"type": "scene", "shape": shape}))
+    wanted = f"on {kind}, which has no UVs" if kind in ("linearcurve", "sdfgrid", "ellipsoids") else ""
+    messages = [record.getMessage() for record in caplog.records if "UVs" in record.getMessage()]
+    assert len(messages) == bool(wanted)
+    assert all(wanted in message for message in messages)
+
+
 @pytest.mark.parametrize("name", ["has_texcoords", "has_vertex_texcoords"])
 def test_uvs_are_found_by_the_name_of_either_mitsuba(name):
     assert not has_uvs(SimpleNamespace(**{name: lambda: False}))

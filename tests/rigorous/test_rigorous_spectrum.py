@@ -271,6 +271,23 @@ def test_a_scalar_spectrum_is_refused(spectrum, tmp_path):
         md.GratingSpectrum.load(tmp_path / "rigorous.exr")
 
 
+def test_an_interrupted_build_has_the_name_of_its_values(tmp_path):
+    relief = gratings.sinusoidal(0.15, 0.03, samples=32)
+
+    def digest(**indices):
+        settings = RigorousSettings(wavelengths=(500, 600), tolerance=0.1, **indices)
+        return build_table._SolvedSurface(relief, settings, 0.1).digest
+
+    names = {
+        digest(int_ior=2, ext_ior=1),
+        digest(int_ior=2.0, ext_ior=1.0),
+        digest(int_ior=2 + 0j, ext_ior=np.float64(1)),
+    }
+    assert len(names) == 1
+    assert digest(int_ior=2.5) not in names
+    assert digest(int_ior=2, ext_ior=1.2) not in names
+
+
 @pytest.mark.slow
 def test_an_interrupted_build_resumes(tmp_path):
     class Enough(Exception):

@@ -192,6 +192,7 @@ def test_text_of_spip_has_its_scale(settings, name, tmp_path):
     [
         ({}, "unit: the file names none for the heights"),
         ({"z_unit": "V"}, "the heights: got the unit 'V'"),
+        ({"z_unit": "nm", "x-pixels": "1e400"}, "got '1e400' for 'x-pixels', wanted a number"),
         ({"z_unit": "nm", "x-pixels": COLUMNS + 1}, f"got {ROWS * COLUMNS} numbers, wanted {ROWS} lines of"),
         ({"z_unit": "nm", "x-length": "wide"}, "the header: got 'wide' for 'x-length'"),
     ],

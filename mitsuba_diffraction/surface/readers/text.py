@@ -37,6 +37,7 @@ cell between commas, semicolons or tabs is a missing pixel.
 from __future__ import annotations
 
 import io
+import math
 import re
 import warnings
 from contextlib import suppress
@@ -184,9 +185,12 @@ def _spip(header: dict[str, str], table: NDArray[np.float64], unit: str | tuple[
 
     def number(name: str) -> float:
         try:
-            return abs(float(header[name]))
+            value = abs(float(header[name]))
         except ValueError:
-            raise RequestError(f"the header: got {header[name][:60]!r} for {name!r}, wanted a number") from None
+            value = math.inf
+        if not math.isfinite(value):
+            raise RequestError(f"the header: got {header[name][:60]!r} for {name!r}, wanted a number")
+        return value
 
     columns, rows = int(number("x-pixels")), int(number("y-pixels"))
     tables = 2 if header.get("voidpixels") not in (None, "", "0") else 1
