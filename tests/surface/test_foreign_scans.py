@@ -467,6 +467,16 @@ def _nested(group, shape):
 
 
 @needs_the_extra
+def test_sizes_of_an_igor_wave_that_cancel_are_refused(tmp_path):
+    # Regression: 2 GB of memory, as the library compares their sum with the file.
+    data = bytearray(ibw())
+    struct.pack_into("<2i", data, 36, 10**9, -(10**9))
+    (tmp_path / "scan.ibw").write_bytes(data)
+    with pytest.raises(ValueError, match=r"an Igor wave whose parts have \(.*-1000000000.*\) bytes"):
+        read_height_field(tmp_path / "scan.ibw")
+
+
+@needs_the_extra
 @pytest.mark.parametrize("compressed", [False, True])
 def test_an_archive_after_a_thumbnail_is_read(compressed, tmp_path):
     (tmp_path / "scan.zon").write_bytes(zon(compressed))

@@ -42,7 +42,7 @@ _SUR_AT = 334
 # Units of x, y and heights, of their steps, then of the axes: six texts of 16 bytes.
 _SUR_UNITS, _SUR_UNIT = 180, 16
 _NMS_HEADER = 3468
-_IBW_HEADER = 384
+_IBW_HEADER, _IBW_SIZES = 384, 4  # bytes; offset of thirteen int32
 _IBW_LABELS, _IBW_DIMENSIONS, _IBW_UNIT = 36, 132, 212  # offsets of four int32, of four int32, of a text
 _TIFF = "jpk", "ps", "lext"
 _JPK_GRID = ("ScanWidth", "ScanLength")  # pixels, by the library's names
@@ -253,6 +253,9 @@ def _ibw(data: bytes) -> bytes:
     order = "<" if data[:1] == b"\5" else ">"
     if len(data) < _IBW_HEADER or struct.unpack_from(f"{order}h", data)[0] != 5:
         return data
+    sizes = struct.unpack_from(f"{order}13i", data, _IBW_SIZES)
+    if min(sizes) < 0 or sum(sizes) > len(data):
+        raise RequestError(f"an Igor wave whose parts have {sizes} bytes, wanted at most {len(data)} in all")
     (columns_named,) = struct.unpack_from(f"{order}4x i", data, _IBW_LABELS)
     *sides, third, fourth = struct.unpack_from(f"{order}4i", data, _IBW_DIMENSIONS)
     if min(sides) < 2 or third or fourth or columns_named:
