@@ -210,7 +210,7 @@ def _channels(table: SliceTable | AmplitudeTable) -> dict[str, np.ndarray]:
 
 
 def _table(header: dict, pixels: dict[str, np.ndarray], max_kappa: float) -> SliceTable | AmplitudeTable:
-    kind, count = header["representation"], header["channelCount"]
+    kind, count = header["representation"], min(header["channelCount"], len(pixels))  # which the caller compares
     if kind == SliceTable.representation:
         terms = 4 if "S(000.3)" in pixels else 3
         values = [[pixels[f"S({k:03d}.{p})"] for p in range(terms)] for k in range(count // terms)]

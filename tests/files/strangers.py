@@ -464,11 +464,11 @@ def _with_channel(name):
     return _of_file(".exr", lambda path: OpenEXR.File(header, pixels).write(str(path)))
 
 
-def _with(powers=lambda values: values, **changed):
+def _with(powers=lambda values: values, representation="slices", **changed):
     """A spectrum with other powers, or other entries of its header."""
 
     def write_changed(path):
-        path.write_bytes(_spectrum("line"))
+        path.write_bytes(_spectrum("line", representation=representation, tolerance=0.1))
         file = OpenEXR.File(str(path), separate_channels=True)
         header = {name: value for name, value in file.header().items() if name not in ("channels", "dataWindow")}
         channels = {name: powers(np.array(channel.pixels)) for name, channel in file.channels().items()}
@@ -556,6 +556,7 @@ CRAFTED = {
     "large_tile": (".exr", lambda: _with(tileSize=np.array([1e12, 1e12])), load_spectrum),
     "negative_powers": (".exr", lambda: _with(lambda values: -values), load_spectrum),
     "large_powers": (".exr", lambda: _with(lambda values: values + np.float32(1e30)), load_spectrum),
+    "many_channels": (".exr", lambda: _with(representation="taylor", channelCount=2**31 - 1), load_spectrum),
     "long_source": (".exr", lambda: _with(source="x" * 3_000_000), load_spectrum),
 }
 # The same, of files that take seconds to make, or need the extra.
