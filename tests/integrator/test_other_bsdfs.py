@@ -116,3 +116,15 @@ def test_the_opacity_of_a_mask_counts_once(llvm):
     assert means["diffraction_path"] == pytest.approx(means["volpath"], rel=0.01)
     assert means["prb"] == pytest.approx(means["volpath"], rel=0.01)
     assert means["path"] == pytest.approx(0.7 * means["volpath"], rel=0.01)
+
+
+@pytest.mark.parametrize("kind", ["ellipsoids", "ellipsoidsmesh"])
+def test_rays_meet_ellipsoids_from_outside_only(llvm, tmp_path, kind):
+    """In Mitsuba 3.9.1: docs/integrators.md advises against them, and random scenes have none."""
+    names = "x y z nx ny nz scale_0 scale_1 scale_2 rot_0 rot_1 rot_2 rot_3"
+    header = ["ply", "format ascii 1.0", "element vertex 1", *(f"property float {name}" for name in names.split())]
+    path = tmp_path / "one.ply"
+    path.write_text("\n".join([*header, "end_header", "0 0 0 0 0 0 0.1 0.1 0.1 0 0 0 1", ""]))
+    built = mi.load_dict({"type": "scene", "shape": {"type": kind, "filename": str(path)}})
+    found = {z: bool(built.ray_test(mi.Ray3f(mi.Point3f(0.01, 0.02, z), mi.Vector3f(0, 0, 1)))[0]) for z in (-20, 0)}
+    assert found == {-20: True, 0: False}

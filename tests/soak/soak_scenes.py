@@ -7,8 +7,7 @@ after an update of some parameters, with or without a frame before it. A seed gi
   a base, transmission as interface or sheet; bare or in `twosided`, `mask`, `blendbsdf`, `normalmap`, `bumpmap`; turned
   by a number or a texture
 - on `rectangle`, `disk`, `sphere`, `cylinder`, `cube`, `ply` and `obj` (a bent sheet with UVs), `instance`,
-  `bsplinecurve`, `linearcurve`, `sdfgrid`, `ellipsoids`, `ellipsoidsmesh`; some flipped, some under a transform that
-  shears
+  `bsplinecurve`, `linearcurve`, `sdfgrid`; some flipped, some under a transform that shears
 - a floor, at times a wall that shares its BSDF (which Mitsuba merges), and at times another object: `diffuse` with
   each kind of spectrum and texture, `plastic`, `roughplastic`, `conductor`, `roughconductor`, `dielectric`,
   `roughdielectric`, `thindielectric`, `principled`, `principledthin`, `hair`, `null`, `mask`, `blendbsdf`, `twosided`,
@@ -18,8 +17,9 @@ after an update of some parameters, with or without a frame before it. A seed gi
 - `perspective`, at times with a shifted principal point, `thinlens`, `orthographic`; each sampler and filter of
   reconstruction; a crop window; depths from 2 to 6 or no limit, with Russian roulette from 3 or 5.
 
-It draws no participating media, which `path` and `diffraction_path` do not render, and no `timed_sunsky`, which no
-integrator of Mitsuba 3.9.1 renders in `llvm_ad_spectral`.
+It draws no participating media, which `path` and `diffraction_path` do not render; no `timed_sunsky`, which no
+integrator of Mitsuba 3.9.1 renders in `llvm_ad_spectral`; no `ellipsoids` and `ellipsoidsmesh`, which rays meet from
+outside only, so that paths from the light and from the eye have other obstacles (docs/integrators.md).
 
 Lobes are wide, and lamps that are seen in mirrors large, so that `path` converges.
 """
@@ -41,7 +41,7 @@ from mitsuba_diffraction.render.scene_file import SceneFile
 SECONDS = 3.0  # of all pictures of a scene
 LONGER = 8  # times as long, of a second look with other seeds
 SHAPES = ("rectangle", "disk", "sphere", "cylinder", "cube", "ply", "obj")
-OTHER_SHAPES = ("bsplinecurve", "linearcurve", "sdfgrid", "ellipsoids", "ellipsoidsmesh")
+OTHER_SHAPES = ("bsplinecurve", "linearcurve", "sdfgrid")
 
 
 @functools.cache
@@ -272,17 +272,6 @@ class RandomScene:
         mi.VolumeGrid(np.float32(np.sqrt(x * x + y * y + z * z) - 0.7 + 0.1 * x * y)[..., None]).write(str(path))
         return path
 
-    def ellipsoids(self):
-        count, path = 4, self.file("ellipsoids.ply")
-        rotations = self.rng.normal(size=(count, 4))
-        rotations /= np.linalg.norm(rotations, axis=1)[:, None]
-        centres, normals = self.rng.uniform(-0.5, 0.5, (count, 3)), np.zeros((count, 3))
-        rows = np.hstack([centres, normals, self.rng.uniform(0.15, 0.4, (count, 3)), rotations])
-        names = ["x", "y", "z", "nx", "ny", "nz", "scale_0", "scale_1", "scale_2", "rot_0", "rot_1", "rot_2", "rot_3"]
-        header = ["ply", "format ascii 1.0", f"element vertex {count}", *(f"property float {name}" for name in names)]
-        path.write_text("\n".join([*header, "end_header", *(" ".join(map("{:.6f}".format, row)) for row in rows), ""]))
-        return path
-
     def shape(self, size, height, *children, kinds=SHAPES):
         kind, parameters, placed = self.pick(*kinds), {}, [self.transform(size, height)]
         if self.chance(0.1):
@@ -300,8 +289,6 @@ class RandomScene:
         elif kind == "sdfgrid":
             scale, moved = vector("scale", [1.5 * size] * 3), vector("translate", self.place(height))
             placed, parameters = [to_world(scale, moved)], {"filename": self.distances()}
-        elif kind.startswith("ellipsoids"):
-            placed, parameters = [self.transform(1.2 * size, height)], {"filename": self.ellipsoids()}
         return plugin("shape", kind, *placed, *children, **parameters)
 
     def gratings(self):
@@ -335,7 +322,7 @@ class RandomScene:
                 facing = to_world(f'<scale value="{size}"/>', look)
                 return plugin("shape", self.pick("rectangle", "disk"), facing, emitter)
             bsdf = [self.receiver()] * self.chance(0.2)
-            kinds = ("sphere", "cylinder", "cube", "ply", "ellipsoidsmesh")
+            kinds = ("sphere", "cylinder", "cube", "ply")
             return self.shape(size, self.uniform(2.5, 4), *bsdf, emitter, kinds=kinds)
         if kind == "constant":
             return plugin("emitter", kind, self.colour("radiance", 0.3, varies=False), **of)
