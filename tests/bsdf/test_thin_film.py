@@ -244,6 +244,21 @@ def test_a_thickness_may_vary_over_the_surface(llvm):
         np.testing.assert_allclose(evaluate(varying, wi, wo, uv=(u, 0.5))[0], expected, rtol=1e-5)
 
 
+@pytest.mark.parametrize("thickness", ["number", "texture"])
+@pytest.mark.parametrize("scale", ["number", "texture"])
+def test_the_bounds_of_a_thickness_are_those_of_its_products(llvm, thickness, scale):
+    """The tables of E and of the samplers hold the films between them."""
+    values = {"thickness": [0.05, 0.1], "scale": [0.4, 0.9]}
+    kinds = {"thickness": thickness, "scale": scale}
+    given = {name: bitmap([of]) if kinds[name] == "texture" else of[0] for name, of in values.items()}
+    film = {"thin_film_ior": 2.35, "thin_film_thickness": given["thickness"], "thin_film_scale": given["scale"]}
+    bsdf = load(int_ior=1.5, **film)
+    (found,), bounds = bsdf.layers.grating.theory.material.thicknesses()
+    used = [of if kinds[name] == "texture" else of[:1] for name, of in values.items()]
+    products = [a * b for a, b in itertools.product(*used)]
+    np.testing.assert_allclose([found * bound for bound in bounds], [min(products), max(products)], rtol=1e-6)
+
+
 def test_a_metal_may_vary_under_a_film(llvm):
     metal = bitmap([[0.5, 2.0]], filter_type="nearest")
     filmed = load(eta=metal, k=3.0, thin_film_ior=2.0, thin_film_thickness=0.1)

@@ -1,6 +1,7 @@
 """SURFACE[,name=value…]: one form for all commands, and the options of two of them."""
 
 import importlib
+import itertools
 import re
 from pathlib import Path
 
@@ -169,3 +170,19 @@ def test_a_wrong_value_is_one_line(text, message, command):
     code, out, error = command("precompute", text)
     assert (code, out, error.count("\n")) == (2, "", 1)
     assert re.search(message, error), error
+
+
+def test_the_longest_of_several_files_is_the_source_or_the_value(tmp_path, monkeypatch):
+    """Whichever of the names up to a comma exist."""
+    monkeypatch.chdir(tmp_path)
+    parts = ["a.npy", "b=1.npy", "c=2.npy", "d=3"]
+    names = [",".join(parts[:end]) for end in (1, 2, 3)]
+    for exists in itertools.product([False, True], repeat=3):
+        for name, one in zip(names, exists, strict=True):
+            (tmp_path / name).write_text("") if one else (tmp_path / name).unlink(missing_ok=True)
+        end = max((k for k, one in enumerate(exists, 1) if one), default=1)
+        source, values = parsed(",".join(parts))
+        assert (source, list(values)) == (names[end - 1], [part.partition("=")[0] for part in parts[end:]])
+        source, values = parsed(f"x,e={','.join(parts)}")
+        assert (source, list(values)) == ("x", ["e", *(part.partition("=")[0] for part in parts[end:])])
+        assert Path(values["e"]).name == names[end - 1]

@@ -295,6 +295,15 @@ def test_the_table_is_stored_with_the_spectrum(tmp_path, monkeypatch):
     assert bsdf.layers.grating.theory.energy is not None
 
 
+def test_a_saved_spectrum_for_longer_wavelengths_has_the_table_of_these(tmp_path):
+    """That in its file ends at the longest wavelength for which it was made."""
+    shorter, longer = (md.precompute(MAKE["blazed"](), wavelengths=(360, last)) for last in (600, 830))
+    shorter.save(tmp_path / "blazed.exr")
+    found = md.GratingSpectrum.load(tmp_path / "blazed.exr").up_to(830).energy_table()
+    assert found.layout == longer.energy_table().layout
+    np.testing.assert_array_equal(found.values, longer.energy_table().values)
+
+
 def test_a_surface_that_is_loaded_again_has_the_tables_that_it_had(tmp_path, monkeypatch):
     of = spectrum("deep blazed")
     of.save(tmp_path / "s.exr")
