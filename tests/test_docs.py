@@ -337,3 +337,6 @@ def test_the_manual_is_built_without_warnings(tmp_path, caplog):
     live = (tmp_path / "site" / "live" / "surfaces.html").read_text(encoding="utf-8")
     assert "<canvas" in live
     assert live.count('type="application/json"') == 10  # shaders, names, and eight surfaces
+    turning = (tmp_path / "site" / "live" / "turning.html").read_text(encoding="utf-8")
+    assert turning.count('type="application/json"') == 5
+    assert 'src="live/turning.html#turn"' in (tmp_path / "site" / "index.html").read_text(encoding="utf-8")

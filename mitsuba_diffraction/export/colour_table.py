@@ -188,7 +188,8 @@ class OrderColours:
     """C of separate orders, a look-up for each.
 
     Attributes:
-        frequencies: q_m of all but order 0, cycles/µm, (n, 2).
+        frequencies: q_m, cycles/µm, (n, 2).
+        tile_size: T, µm, of which q_m is a multiple of 1/T.
         powers: η_m at equal steps of κ from 0 to `max_kappa`, (n, k).
         max_kappa: rad/µm, at the height scale of the table.
         lobe_width: σ_q, cycles/µm.
@@ -201,6 +202,7 @@ class OrderColours:
     """
 
     frequencies: Real
+    tile_size: tuple[float, float]
     powers: Real
     max_kappa: float
     lobe_width: float
@@ -224,6 +226,8 @@ class OrderColours:
         cosine = np.sqrt(length**2 + w**2) / (2 * self.coat)
         low, high = 1e3 / _LONGEST, 1e3 / _SHORTEST
         for q, eta in zip(self.frequencies, self.powers, strict=True):
+            if not q.any():  # `mirror`
+                continue
             c = u @ q / length**2
             offset = q @ q - (c * length) ** 2
             visible = np.clip(c, low, high)
@@ -303,6 +307,7 @@ def _along(spectrum: GratingSpectrum, axis: int, q: Real) -> scipy.sparse.csr_ma
 def _orders(viewed: Viewed) -> OrderColours:
     """Return the colours of separate orders."""
     spectrum, grid = viewed.spectrum, viewed.spectrum.grid
+    assert isinstance(grid, OrderGrid)  # see `Viewed.has_separate_orders`
     max_kappa = 2 * np.pi * viewed.range_w[1] / (_SHORTEST * 1e-3)
     powers = np.stack([viewed.powers(kappa) for kappa in np.linspace(0, max_kappa, _KAPPAS)], -1)
     q = np.stack(np.meshgrid(*grid.frequencies()), -1)
@@ -312,7 +317,7 @@ def _orders(viewed: Viewed) -> OrderColours:
         wanted = f"wanted at most {MAX_ORDERS}; with a smaller coherence_length they overlap"
         raise RequestError(f"{spectrum.source}: got {count} separate orders, {wanted}")
     row, column = np.argwhere(length == 0)[0]
-    kept[row, column] = False
+    kept[row, column] = True
     narrow, wide = _WIDTH_RANGE
     nu = np.linspace(1e3 / _LONGEST, 1e3 / _SHORTEST, 1441)
     # E dλ = E dν/ν²; with λ⁻² of C, 1000 nm/µm are left.
@@ -331,6 +336,7 @@ def _orders(viewed: Viewed) -> OrderColours:
             layer += (power * lobe * viewed.reflectance(wavelength, u, w_of_layer))[:, None] * colour
     return OrderColours(
         q[kept],
+        grid.tile_size,
         powers[kept],
         max_kappa,
         spectrum.lobe_width,

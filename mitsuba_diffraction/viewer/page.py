@@ -46,8 +46,14 @@ _RINGS = dict(zip(DISCS, ((7.5 / 60, 23 / 60, 58.5 / 60), (7.5 / 60, 22.6 / 60, 
 _ASSETS = Path(__file__).parent / "assets"
 _STYLES = ("page.css",)
 _SCRIPTS = (
-    *("data.js", "gl.js", "colour.js", "spectrum.js", "shapes.js", "view.js", "shader_2014.js"),
-    *("renderer.js", "pick.js", "command.js", "controls.js", "main.js"),
+    _ASSETS.parents[1] / "export/assets/three/shading.js",
+    *(
+        _ASSETS / f"{name}.js"
+        for name in (
+            *("data", "gl", "colour", "spectrum", "colours", "shapes", "view", "shader_2014"),
+            *("renderer", "pick", "command", "controls", "main"),
+        )
+    ),
 )
 
 
@@ -68,7 +74,7 @@ def page(surface: Surface, *others: Surface, picture: NDArray[np.float16] | None
         "title": html.escape(surface.name),
         "mark": MARK,
         "styles": "\n".join((_ASSETS / name).read_text(encoding="utf-8") for name in _STYLES),
-        "scripts": "\n".join((_ASSETS / name).read_text(encoding="utf-8") for name in _SCRIPTS),
+        "scripts": "\n".join(path.read_text(encoding="utf-8") for path in _SCRIPTS).replace("\nexport ", "\n"),
         "shaders": _json(shaders),
     }
     names = [one.name for one in (surface, *others)]

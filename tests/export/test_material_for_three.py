@@ -30,8 +30,7 @@ THREE = Path(__file__).parents[2] / "node_modules" / "three"
 MODULE = Path(colour_file.__file__).parent / "assets" / "three"
 OPTIONS = ["--use-angle=swiftshader", "--enable-unsafe-swiftshader", "--no-sandbox"]
 PAGE = """<!doctype html><meta charset="utf-8"><link rel="icon" href="data:,"><script type="importmap">{"imports": {
-"three": "./three/build/three.webgpu.js", "three/webgpu": "./three/build/three.webgpu.js",
-"three/tsl": "./three/build/three.tsl.js"}}</script><script type="module" src="page.js"></script>"""
+"three": "./three/build/three.module.js"}}</script><script type="module" src="page.js"></script>"""
 
 
 class Quiet(http.server.SimpleHTTPRequestHandler):
@@ -195,6 +194,7 @@ def lit(surface, colours, points, frame, position, light, radius=0.0, count=300)
     [
         ("skin", {"light": "directional", "material": {"orientation": 30}}),
         ("skin", {"light": "point", "lamp": {"radius": 0.3}, "instanced": True}),
+        ("skin", {"light": "directional", "lamp": {"angularRadius": 0.0175}}),
         ("blaze", {"light": "spot", "material": {"orientation": -20}}),
         ("blaze", {"light": "point", "lamp": {"radius": 0.15}}),
         ("foil of gold", {"light": "directional", "lamp": {"angularRadius": 0.035}, "material": {"radial": True}}),
@@ -216,10 +216,38 @@ def test_a_lit_plane_has_the_colours_of_its_directions(name, options, exported, 
     inside = (np.abs(points[:, :2]) < 0.9).all(axis=1) & (np.linalg.norm(points, axis=1) > 0.1)
     found = (found @ SRGB_TO_XYZ.T)[inside]
     error = difference(found, wanted[inside])
-    # Of a lamp the material takes 16 points, or a Gaussian of its variance, whose edges are soft.
+    # Of a lamp the material takes up to 16 Gaussians with its variance.
     assert error.mean() < (1 if radius else 0.3)
-    assert radius or np.percentile(error, 95) < 1.5
-    assert found.sum() == pytest.approx(wanted[inside].sum(), rel=0.03)
+    assert np.percentile(error, 95) < (5 if radius else 1.5)
+    # Few pixels have the image of a lamp in the mirror direction, whose edges are soft.
+    assert found.sum() == pytest.approx(wanted[inside].sum(), rel=0.05 if radius else 0.03)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", ["skin", "foil of gold"])
+def test_a_rectangle_lights_by_its_area(name, exported, tab):
+    surface, colours = exported(name)
+    position, (width, height), count = np.array([-0.5, 2.1, 3.0]), (0.8, 0.3), 24
+    shown = {"eye": EYE.tolist(), "position": position.tolist(), "size": SIZE, "material": {}, "light": "area"}
+    found = call(tab, "plane", f"{name.replace(' ', '_')}.bin", {**shown, "sizes": [width, height]})[:, :3]
+    assert not tab.messages, "\n".join(tab.messages)[:3000]
+    points = seen()
+    z = unit(position)
+    x = unit(np.cross([0, 1, 0], z))
+    places = (np.arange(count) + 0.5) / count - 0.5
+    wo, wanted = unit(EYE - points), 0
+    for s in places:
+        for t in places:
+            away = position + s * width * x + t * height * np.cross(z, x) - points
+            wi, square = unit(away), (away**2).sum(axis=1, keepdims=True)
+            area = width * height / count**2 * (wi @ z)[:, None] / square
+            wanted = wanted + f_cos(surface, colours, wi, wo) * area
+    inside = (np.abs(points[:, :2]) < 0.9).all(axis=1)
+    found, wanted = (found @ SRGB_TO_XYZ.T)[inside], mixed(wanted)[inside]
+    error = difference(found, wanted)
+    assert error.mean() < 2
+    assert np.percentile(error, 95) < 6
+    assert found.sum() == pytest.approx(wanted.sum(), rel=0.05)
 
 
 @pytest.mark.slow
@@ -227,10 +255,10 @@ def test_a_file_that_cannot_be_read_is_grey_and_says_so_once(exported, folder, t
     exported("blaze")
     content = (folder / "blaze.bin").read_bytes()
     (folder / "short.bin").write_bytes(content[:-100])
-    (folder / "later.bin").write_bytes(content.replace(b'"version": 1', b'"version": 9'))
+    (folder / "later.bin").write_bytes(content.replace(b'"version": 2', b'"version": 9'))
     (folder / "other.bin").write_bytes(b"glTF" + content[4:])
     shown = {"eye": EYE.tolist(), "position": [0, 0, 3], "size": 8, "material": {}, "light": "directional"}
-    wanted = {"short": "the file was cut short", "later": "version 9, wanted 1", "other": "not a file of colours"}
+    wanted = {"short": "the file was cut short", "later": "version 9, wanted 2", "other": "not a file of colours"}
     for name, problem in wanted.items():
         grey = call(tab, "plane", f"{name}.bin", shown)[27, :3]
         assert np.ptp(grey) < 1e-3 < grey.min()

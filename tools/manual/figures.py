@@ -136,8 +136,8 @@ FIGURES = (
     ),
     Figure(
         ("viewer.png", "viewer_snake.png"),
-        """python tools/manual/viewer_picture.py {out}/viewer.png --frames 3
-        python tools/manual/viewer_picture.py {out}/viewer_snake.png --surface xenopeltis --frames 10""",
+        """python tools/manual/viewer_picture.py {out}/viewer.png --frames 12
+        python tools/manual/viewer_picture.py {out}/viewer_snake.png --surface xenopeltis --frames 12""",
         needs="Chromium (tools/manual/live_browser.py)",
     ),
 )

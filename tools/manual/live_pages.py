@@ -1,8 +1,8 @@
-"""The live page of the manual: a hook of MkDocs (mkdocs.yml), which makes it with the site.
+"""The live pages of the manual: a hook of MkDocs (mkdocs.yml), which makes them with the site.
 
     python tools/manual/live_pages.py FOLDER
 
-writes it to a folder instead.
+writes them to a folder instead.
 """
 
 from __future__ import annotations
@@ -31,27 +31,30 @@ SURFACES = {
     "scan": ("A scan: Elaphe, 5.9 µm", "elaphe_afm.toml", {}),
 }
 """Title, recipe and material of each, in the order of the list in the page of all."""
-ALL = "surfaces"
+PAGES = {"surfaces": tuple(SURFACES), "turning": ("compact_disc", "foil", "xenopeltis")}
+"""The surfaces of pages with several; the start page of the manual shows one that turns."""
 _log = logging.getLogger("mkdocs.hooks.live_pages")
 
 
 @cache  # `mkdocs serve` builds the site anew after each change
 def live_page(name: str) -> str:
-    """Return the page of one of `SURFACES`, or of `ALL`, as HTML."""
+    """Return the page of one of `SURFACES`, or one of `PAGES`, as HTML."""
     surfaces = []
-    for title, recipe, parameters in SURFACES.values() if name == ALL else [SURFACES[name]]:
+    for title, recipe, parameters in (SURFACES[one] for one in PAGES.get(name, (name,))):
         _log.info(f"live/{name}.html: {title}, which takes minutes unless its spectrum is cached")
         surfaces.append(replace(Surface.named(RECIPES / recipe, parameters), name=title))
     return page(*surfaces)
 
 
 def on_files(files: Files, config: MkDocsConfig) -> Files:
-    """Add the page of all surfaces to the site, as live/surfaces.html."""
-    files.append(File.generated(config, f"live/{ALL}.html", content=live_page(ALL)))
+    """Add the pages to the site, as live/surfaces.html and live/turning.html."""
+    for name in PAGES:
+        files.append(File.generated(config, f"live/{name}.html", content=live_page(name)))
     return files
 
 
 if __name__ == "__main__":
     folder = Path(sys.argv[1])
     folder.mkdir(parents=True, exist_ok=True)
-    (folder / f"{ALL}.html").write_text(live_page(ALL), encoding="utf-8")
+    for name in PAGES:
+        (folder / f"{name}.html").write_text(live_page(name), encoding="utf-8")

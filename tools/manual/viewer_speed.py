@@ -1,46 +1,110 @@
-"""Print the table of docs/speed.md on the live view: the time of a frame, of this model and of the shader of 2014.
+"""Print a table of docs/speed.md and draw docs/interactive.png: interactive shaders, the time of a frame, the error.
 
-    python tools/manual/viewer_speed.py
+    python tools/manual/viewer_speed.py docs/interactive.png
 
-A sphere under parallel light, drawn by Chromium's software renderer; both shaders draw all pixels in turn.
+A sphere under parallel light in the live view, drawn by Chromium's software renderer. Times are those of the processor,
+so that other work beside it matters less; errors are ΔE00 from the path-traced picture of view.xml, the shaders of 2014
+at its mean luminance, as published.
 """
 
 from __future__ import annotations
 
 import argparse
-from statistics import median
+import os
+import tempfile
+from pathlib import Path
+from typing import Any
 
+import matplotlib.pyplot as plt
+import numpy as np
 from live_browser import draw, opened
-from live_pages import SURFACES
+from live_pages import RECIPES, SURFACES
+from playwright.sync_api import Page
 
-SIZE, FRAMES = 512, 2  # the first one is compiled
+from mitsuba_diffraction.optics.color import XYZ_to_linear_sRGB, auto_exposure, delta_E, into_gamut, spectrum_to_XYZ
+from mitsuba_diffraction.render import render
+from mitsuba_diffraction.variants import choose_variant
+
+SIZE, SPP = 128, 128
 CONTROLS = 330  # pixels beside the picture
-VARIANTS = ("flss", "nmm", "pq", "nmm_pq", "gem")
+NAMES = {"none": "this model", "flss": "FLSS", "nmm": "NMM", "pq": "PQ", "nmm_pq": "NMM with PQ", "gem": "GEM"}
+TICKS = os.sysconf("SC_CLK_TCK")
+
+
+def processor_seconds(process: int) -> float:
+    """Return the time of a process and of those that it started."""
+    total = 0.0
+    for task in Path(f"/proc/{process}/task").iterdir():
+        total += sum(processor_seconds(int(child)) for child in (task / "children").read_text().split())
+    fields = Path(f"/proc/{process}/stat").read_text().rpartition(")")[2].split()
+    return total + (int(fields[11]) + int(fields[12])) / TICKS
+
+
+def frame_time(tab: Page, side: str, frames: int) -> float:
+    """Return milliseconds of the processor for a frame of a side, beside the geometry."""
+    text = """([side, frames]) => { const { renderer, state } = viewer;
+      for (let k = 0; k < frames; k++) {
+        renderer.geometryFrame = renderer[side].frame;
+        renderer.draw(renderer[side], state, [0, 1], Infinity);
+      } }"""
+    before = processor_seconds(os.getpid())
+    tab.evaluate(text, [side, frames])
+    return 1e3 * (processor_seconds(os.getpid()) - before) / frames
+
+
+def mean_of(tab: Page, side: str) -> np.ndarray[Any, Any]:
+    """Return XYZ and coverage of pixels, from the top."""
+    values = np.array(tab.evaluate(f"Array.from(viewer.renderer.readMean(viewer.renderer.{side}).values)"))
+    return values.reshape(SIZE, SIZE, 4)[::-1]
+
+
+def measured(surface: str) -> dict[str, tuple[float, float]]:
+    """Return milliseconds and mean ΔE00 of each shader."""
+    found: dict[str, tuple[float, float]] = {}
+    recipe = SURFACES[surface][1]
+    with opened(surface, viewport={"width": SIZE + CONTROLS, "height": SIZE}) as tab:
+        state = {"shape": "sphere", "lightWidth": 0, "lightLength": 0, "sky": 0, "hasBase": False, "difference": True}
+        draw(tab, {**state, "right": "none"}, 4)
+        scene = tab.evaluate("viewer.scene()").replace(f'"{Path(recipe).stem}"', f'"{RECIPES / recipe}"')
+        scene = scene.replace('type="path"', 'type="diffraction_path"')
+        with tempfile.TemporaryDirectory() as folder:
+            (path := Path(folder) / "view.xml").write_text(scene)
+            image = render(path, spp=SPP)
+        wanted = spectrum_to_XYZ(image.radiance, image.wavelengths)
+        for variant in NAMES:
+            draw(tab, {**state, "right": variant}, 4 if variant == "none" else 1)
+            side = "model" if variant == "none" else "shader"
+            shown = mean_of(tab, side)
+            inside = shown[..., 3] == 1
+            reference, own = wanted[inside], shown[inside][:, :3]
+            if side == "shader":
+                own = own * (reference[:, 1].sum() / own[:, 1].sum())
+            exposure = auto_exposure(into_gamut(XYZ_to_linear_sRGB(reference)))
+            error = delta_E(*(np.clip(exposure * XYZ, 0, 1) for XYZ in (own, reference))).mean()
+            tab.evaluate("viewer.state.maxFrames = 0")
+            found[variant] = frame_time(tab, side, 50 if side == "model" else 1), float(error)
+            print(surface, NAMES[variant], "{:.0f} ms, ΔE00 {:.2f}".format(*found[variant]), flush=True)
+    return found
 
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("surfaces", nargs="*", default=list(SURFACES))
+    parser.add_argument("output", type=Path)
+    parser.add_argument("surfaces", nargs="*", default=["blaze", "elaphe"])
     options = parser.parse_args()
-    print("| surface | this model, ms |", " | ".join(name.upper().replace("_", " ") for name in VARIANTS), "| MB |")
-    print("|---|---|" + "---|" * (len(VARIANTS) + 1), flush=True)
-    for surface in options.surfaces:
-        with opened(surface, viewport={"width": SIZE + CONTROLS, "height": SIZE}) as tab:
-            state = {"shape": "sphere", "lightWidth": 0, "lightLength": 0, "sky": 0, "difference": True}
-            model, ratios = [], []
-            for variant in VARIANTS:
-                draw(tab, {**state, "right": variant}, FRAMES)
-                own, other = tab.evaluate("viewer.renderer.sides.map((side) => side.milliseconds)")
-                model.append(own)
-                ratios.append(other / own)
-            width = tab.evaluate("viewer.renderer.width")
-            assert width == SIZE, width
-            megabytes = tab.evaluate("viewer.renderer.spectrum.bytes") / 1e6
-        print(
-            f"| {surface} | {median(model):.0f} |",
-            " | ".join(f"{ratio:.2g}" for ratio in ratios),
-            f"| {megabytes:.2g} |",
-        )
+    import mitsuba as mi  # after LLVM has been chosen
+
+    mi.set_variant(choose_variant())
+    figure, axes = plt.subplots(1, len(options.surfaces), figsize=(8, 3.4), sharey=True, squeeze=False)
+    for axis, surface in zip(axes[0], options.surfaces, strict=True):
+        for variant, (time, error) in measured(surface).items():
+            axis.plot(time, error, "o", color="C3" if variant == "none" else "C0")
+            axis.annotate(NAMES[variant], (time, error), xytext=(5, 4), textcoords="offset points", fontsize=8)
+        axis.set(xscale="log", yscale="log", xlabel="processor time of a frame in ms", title=SURFACES[surface][0])
+        axis.margins(x=0.25, y=0.15)
+    axes[0, 0].set_ylabel("mean ΔE00 from the path-traced picture")
+    figure.tight_layout()
+    figure.savefig(options.output, dpi=110)
 
 
 if __name__ == "__main__":

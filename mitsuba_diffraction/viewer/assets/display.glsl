@@ -9,8 +9,6 @@ uniform float uOtherExposure;
 uniform float uDivider;    // pixels from the left
 uniform bool uDifference;
 uniform float uScale;           // of the drawn part of the mean
-uniform float uSmooth;          // how much of a mean over a tile is shown, see shade.glsl
-uniform float uOtherSmooth;
 uniform bool uHasGround;
 uniform vec2 uScreen;           // its size in pixels
 out vec4 oColour;
@@ -139,22 +137,6 @@ vec3 heat(float x) {
   return mix(c, vec3(0.99, 0.99, 0.75), clamp(3.0 * x - 2.0, 0.0, 1.0));
 }
 
-// A pixel, or the mean over a square of 4 x 4 about it, of pixels that show the surface alone.
-vec4 smoothed(highp sampler2D picture, vec2 at, float amount) {
-  vec4 own = texelFetch(picture, ivec2(at), 0), sum = vec4(0.0);
-  if (amount == 0.0 || own.a < 0.999) return own;
-  ivec2 first = ivec2(floor(at - 2.0)), last = textureSize(picture, 0) - 1;
-  vec2 inside = at - 2.0 - vec2(first);
-  for (int j = 0; j < 5; j++) {
-    for (int i = 0; i < 5; i++) {
-      vec4 value = texelFetch(picture, clamp(first + ivec2(i, j), ivec2(0), last), 0);
-      vec2 weights = vec2(i == 0 ? 1.0 - inside.x : i == 4 ? inside.x : 1.0, j == 0 ? 1.0 - inside.y : j == 4 ? inside.y : 1.0);
-      if (value.a >= 0.999) sum += weights.x * weights.y * value;
-    }
-  }
-  return mix(own, sum.a > 0.0 ? sum / sum.a : own, amount);
-}
-
 const float MAX_DELTA_E = 30.0;
 
 vec3 toLinearChannels(vec3 encoded) {
@@ -162,12 +144,12 @@ vec3 toLinearChannels(vec3 encoded) {
 }
 
 void main() {
-  vec4 mean = smoothed(uMean, gl_FragCoord.xy * uScale, uSmooth);
+  vec4 mean = texelFetch(uMean, ivec2(gl_FragCoord.xy * uScale), 0);
   vec3 ours = shown(ofMean(mean), uExposure);
   vec4 found = vec4(0.0);
   vec2 at = gl_FragCoord.xy * uOtherScale.xy + uOtherScale.zw;
   if (all(greaterThanEqual(at, vec2(0.0))) && all(lessThan(ivec2(at), textureSize(uOther, 0)))) {
-    found = smoothed(uOther, at, uOtherSmooth);
+    found = texelFetch(uOther, ivec2(at), 0);
   }
   vec3 theirs = shown(uOtherIsPicture ? found.rgb : ofMean(found), uOtherExposure);
   float cover = uOtherIsPicture ? 1.0 : found.a;

@@ -1,11 +1,13 @@
 // Starts the page.
 
-const MAX_FRAMES = 128;
-const EXPOSED_FRAMES = [1, 4, 16];  // after which the exposure is found, from less and less noise
+const MAX_FRAMES = 32;
+const EXPOSED_FRAMES = [1, 4];  // after which the exposure is found
 const BUDGET_MILLISECONDS = 80;  // of drawing between two turns of the page
 const LAMP_DISTANCE = 1.2;
 const BUSY_MILLISECONDS = 60;  // of a frame, above which fewer pixels are drawn at first, and while dragging
 const PREVIEW_SCALE = 0.25;
+const TURNING = location.hash === "#turn";  // alone, without controls, one surface after the other
+const TURN = { degrees: 12, surface: 15 };  // a second; seconds
 
 const shapeOf = (data) => (data.shape === "coil" && !data.coil ? "sphere" : data.shape);
 
@@ -188,6 +190,7 @@ async function start(number = 0) {
   }
 
   function draw(budget = BUDGET_MILLISECONDS) {
+    while (!renderer.colours.shown) renderer.colours.prepare(state, Infinity);
     // The first frame of this model does not wait for a slow shader.
     const sides = renderer.model.frame === 0 ? [renderer.model] : renderer.sides;
     const busy = sides.filter((side) => side.frame < state.maxFrames);
@@ -209,19 +212,30 @@ async function start(number = 0) {
   }
 
   let stopped = false;
-  function tick() {
+  let before = null;
+  function turnOn(now) {
+    state.azimuth += TURN.degrees * Math.min((now - (before ?? now)) / 1000, 0.1);
+    state.lightAzimuth += 0.4 * TURN.degrees * Math.min((now - (before ?? now)) / 1000, 0.1);
+    before = now;
+    dirty = true;
+  }
+
+  function tick(now) {
     if (stopped) return;
+    if (TURNING && !controls.dragging) turnOn(now);
+    const moving = controls.dragging || TURNING;
     fit();
     prepared();
     const slow = renderer.sides.some((side) => !(side.milliseconds <= BUSY_MILLISECONDS) || side.row > 0);
-    if (controls.dragging && dirty && slow) renderer.scale = Math.max(renderer.scale / 2, 0.25);
-    else if (!controls.dragging && renderer.scale < 1) {
+    if (moving && dirty && slow) renderer.scale = Math.max(renderer.scale / 2, 0.25);
+    else if (!moving && renderer.scale < 1) {
       renderer.scale = 1;
       dirty = true;
     }
+    if (renderer.colours.prepare(state, BUDGET_MILLISECONDS, controls.dragging)) dirty = true;
     if (dirty) {
       dirty = false;
-      if (slow && !controls.dragging) preview();
+      if (slow && !moving) preview();
       else {
         held = false;
         renderer.restart();
@@ -255,7 +269,7 @@ async function start(number = 0) {
     state, renderer, data, picker,
     set: (changes) => controls.set(changes),
     evaluate: (pairs) => Array.from(renderer.evaluatePairs(state, Float32Array.from(pairs))),
-    evaluateColours: (pairs, frames) => Array.from(renderer.evaluateColours(state, Float32Array.from(pairs), frames)),
+    evaluateColours: (pairs) => Array.from(renderer.evaluateColours(state, Float32Array.from(pairs))),
     evaluateShader: async (pairs) => {
       await shader2014.prepare(state, () => {});
       return Array.from(renderer.evaluateShader(shader2014, state, Float32Array.from(pairs)));
@@ -303,7 +317,9 @@ async function pictureOf(gl, picture) {
 }
 
 window.viewer = {};
+document.body.classList.toggle("turning", TURNING);
 function show(number) {
+  if (TURNING) setTimeout(() => show((number + 1) % NAMES.length), 1000 * TURN.surface);
   window.viewer.ready = start(number).catch((error) => {
     const text = error instanceof NotSupported ? error.message : `This page failed: ${error.message}`;
     $("failure").textContent = text;

@@ -1,27 +1,17 @@
 // f = T_i T_o R K G S(q; kappa)/lambda^2 + (1 - R_i)(1 - R_o) base/pi, in 1/sr: bsdf/orders.py, bsdf/continuum.py,
-// bsdf/directions.py, bsdf/coat.py and optics/geometry.py of the package, for reflected light. E is one.
-// KIND, MATERIAL, CUBIC and HAS_BASE are constants of the program (spectrum.js), since some renderers execute both
-// branches of a condition.
-// Directions are unit vectors along the pattern's axes, z the normal, both away from the surface; outside of a coat, which
-// keeps their tangential components. Lengths are in um.
+// bsdf/directions.py, bsdf/coat.py and optics/geometry.py of the package, for reflected light. E is one. It follows
+// shading.js. KIND, MATERIAL, CUBIC and HAS_BASE are constants of the program (spectrum.js), since some renderers execute
+// both branches of a condition.
 
 uniform highp sampler2DArray uTable;  // a_p of c = sum_p a_p t^p: columns m_x, rows m_y, layers intervals of kappa
 uniform float uUnit;                  // factor of the table
 uniform float uIntervalsPerKappa;
-uniform ivec2 uMaxOrder;
-uniform vec2 uPerPitch;               // T of orders; 1/spacing of splines
-uniform ivec2 uCount;                 // of the lobes that contribute at one q
+uniform ivec2 uCount;                 // of the lobes that contribute at one q; uPerPitch of splines is 1/spacing
 uniform bvec2 uReadsAll;              // whether all orders contribute
 uniform vec2 uHalfWidth;              // of a lobe
 uniform vec2 uPeak;                   // of a lobe along one axis
-uniform float uSigma;                 // sigma_q
 uniform vec2 uLimit;                  // |q| at which splines end
-uniform float uHeightScale;
-uniform float uMinCosine;
-uniform bool uShadowing;
 
-uniform float uCoat;                  // index of a clear layer over the relief; one without
-uniform float uEta;                   // index of the material relative to the layer
 uniform highp sampler2D uIndex;       // n + ik at each nm from 360
 uniform vec3 uPigment;                // coefficients of the reflectance of the base
 
@@ -30,56 +20,13 @@ uniform float uSky;                   // radiance of the sky relative to the irr
 const int DIELECTRIC = 0, CONDUCTOR = 1, MIRROR = 2;
 const int RESOLVED = 0, LINES = 1, WINDOW = 2, SPLINES = 3;
 const int MARGIN = 3;  // of the table, in nodes
-const float PI = 3.14159265358979;
 const float SHORTEST = 360.0, LONGEST = 830.0;
 const vec3 D65 = vec3(0.9505, 1.0, 1.089);
 const float GROUND = 0.5, ZENITH = 5.0;  // radiance of the sky below the horizon and at the zenith, relative to uSky
 
 mat3 frame;  // columns: the pattern's axes and the normal
 vec3 facet = vec3(0.0, 0.0, 1.0);  // the normal of the mesh, along them
-
-float horizonGain(float x) {
-  float t = max(1.0 - 0.25 * x, 0.0);
-  float p = 3.5662365;
-  p = p * t - 9.23048089;
-  p = p * t + 10.57318562;
-  p = p * t - 5.03522703;
-  p = p * t + 0.81494507;
-  p = p * t - 0.04034151;
-  return 1.0 + t * t * p;
-}
-
-// k_z next to the relief, from the cosine outside.
-float inner(float cosine) {
-  return sqrt(max(cosine * cosine + (uCoat * uCoat - 1.0), 1e-12));
-}
-
-// K G from cos^2 of both directions and |lambda q|^2.
-float kG(vec2 squares, float tangentSquare) {
-  vec2 k = sqrt(max(squares + (uCoat * uCoat - 1.0), 1e-12));
-  float vz = k.x + k.y;
-  vec2 a = (tangentSquare + vz * vz) / (2.0 * k);
-  float perVz = 1.0 / vz;
-  float factor = a.x * perVz * (a.y * perVz);
-  return uShadowing ? min(factor, 2.0 * min(a.x, a.y) * perVz) : factor;
-}
-
-// cos^2 of both directions of an order at lambda q = change, and in z the gain of its lobe.
-vec3 squaresAndGain(vec3 wi, vec3 wo, vec2 change, float perWidth) {
-  float squareI = wi.z * wi.z, squareO = wo.z * wo.z;
-  float orderO = squareI - dot(change, 2.0 * wi.xy + change);
-  float orderI = squareO - dot(change, 2.0 * wo.xy + change);
-  float gain = 0.0;
-  if (min(orderI, orderO) > 0.0) {
-    gain = horizonGain(0.5 * perWidth * min(squareI, orderO)) * horizonGain(0.5 * perWidth * min(squareO, orderI));
-  }
-  return vec3(0.5 * (squareI + orderI), 0.5 * (squareO + orderO), gain);
-}
-
-float orderFactor(vec3 wi, vec3 wo, vec2 tangent, float perWidth) {
-  vec3 found = squaresAndGain(wi, wo, tangent, perWidth);
-  return found.z > 0.0 ? kG(found.xy, dot(tangent, tangent)) * found.z : 0.0;
-}
+mat3 lightAxes;  // along them: half the width, half the length, and the direction of the light
 
 float continuumFactor(vec3 wi, vec3 wo, vec2 tangent, float perWidth) {
   vec2 squares = vec2(wi.z * wi.z, wo.z * wo.z);
@@ -101,11 +48,6 @@ vec2 lobe(vec2 m, vec2 q) {
   return mix(value, vec2(0.0), greaterThan(abs(offset), uHalfWidth));
 }
 
-// K G of a continuum where neither direction is grazing.
-float steepFactor(vec3 wi, vec3 wo, vec2 tangent) {
-  return kG(vec2(wi.z * wi.z, wo.z * wo.z), dot(tangent, tangent));
-}
-
 // kappa in intervals of the table.
 float intervalsOf(vec3 wi, vec3 wo, float frequency) {
   return (inner(wi.z) + inner(wo.z)) * 2.0 * PI * frequency * uHeightScale * uIntervalsPerKappa;
@@ -122,6 +64,10 @@ float power(ivec2 m, float x) {
   int interval;
   vec4 powers = powersAt(x, interval);
   return dot(node(m, interval), powers);
+}
+
+float orderPower(ivec2 m, float kappa) {
+  return max(power(m, kappa * uIntervalsPerKappa), 0.0);
 }
 
 // S of splines.
@@ -179,20 +125,8 @@ float scatter(vec3 wi, vec3 wo, float lambda) {
   return density == 0.0 ? 0.0 : density * continuumFactor(wi, wo, tangent, 1.0 / (lambda * uSigma));
 }
 
-float dielectricOf(float cosine, float eta) {
-  float square = eta * eta, inside = sqrt(max(square - 1.0 + cosine * cosine, 0.0));  // k_z; without cancellation
-  float s = (cosine - inside) / max(cosine + inside, 1e-12);
-  float p = (square * cosine - inside) / max(square * cosine + inside, 1e-12);
-  return 0.5 * (s * s + p * p);
-}
-
 float dielectric(float cosine) {
   return dielectricOf(cosine, uEta);
-}
-
-// The face of the coat, at the cosine outside.
-float face(float cosine) {
-  return dielectricOf(cosine, uCoat);
 }
 
 // Radiance of the sky in a direction along the pattern's axes, relative to uSky.
@@ -201,19 +135,19 @@ float skyIn(vec3 direction) {
   return GROUND + (ZENITH - GROUND) * up * up;
 }
 
-// What enters a dielectric, through its coat.
-float transmittance(float cosine) {
-  return (1.0 - face(cosine)) * (1.0 - dielectric(min(inner(cosine) / uCoat, 1.0)));
+// What the relief of scales leaves of light: that of Mitsuba's `normalmap` (Estevez et al. 2019).
+float facing(vec3 wi) {
+  float cosine = dot(wi, facet), alpha2 = min(0.125 * (1.0 / (facet.z * facet.z) - 1.0), 1.0);
+  return cosine <= 0.0 ? 0.0 : 2.0 / (1.0 + sqrt(1.0 + alpha2 * (1.0 / (cosine * cosine) - 1.0)));
+}
+
+vec3 underSky(vec3 XYZ, vec3 wi, float solidAngle) {
+  return XYZ * uSky * skyIn(wi) * facing(wi);
 }
 
 // cos of the angle between both directions and their half vector, next to the relief.
 float halfCosine(vec3 wi, vec3 wo) {
   return min(0.5 * length(vec3(wi.xy + wo.xy, inner(wi.z) + inner(wo.z))) / uCoat, 1.0);
-}
-
-// Whether the table has the angles of both directions.
-bool covered(vec3 wi, vec3 wo) {
-  return inner(min(wi.z, wo.z)) >= uMinCosine * uCoat;
 }
 
 float conductor(float cosine, vec2 index) {

@@ -1,18 +1,10 @@
-// XYZ of pairs of directions under parallel light of irradiance one, in one frame.
+// XYZ of pairs of directions under parallel light of irradiance one.
 uniform highp sampler2D uIncident;
 uniform highp sampler2D uOutgoing;
-uniform vec4 uRandom;
 out vec4 oValue;
 
-vec4 lightAt(int n) {
-  return vec4(texelFetch(uIncident, ivec2(gl_FragCoord.xy), 0).xyz, 1.0);
-}
-
-vec4 lightTo(vec2 place) {
-  return lightAt(0);
-}
-
 void main() {
-  random = uRandom;
-  oValue = vec4(radiance(texelFetch(uOutgoing, ivec2(gl_FragCoord.xy), 0).xyz), 1.0);
+  ivec2 at = ivec2(gl_FragCoord.xy);
+  lightAxes = mat3(vec3(0.0), vec3(0.0), texelFetch(uIncident, at, 0).xyz);
+  oValue = vec4(radiance(texelFetch(uOutgoing, at, 0).xyz), 1.0);
 }

@@ -1,15 +1,14 @@
 // Draws: positions and normals (geometry), the mean of frames of each side, the screen.
 
-const GOLDEN = 0.6180339887498949;
 const R2 = [0.7548776662466927, 0.5698402909980532];  // steps of a two-dimensional sequence (Roberts 2018)
-const R4 = [0.8566748838545029, 0.733891856627126, 0.6287067210378087, 0.5385972572236101];  // of a four-dimensional one
-const POINTS = 4;  // of the light in a frame of resolved orders, at most
-const TILE_POINTS = 256;  // of a tile of 4 x 4 pixels in a frame, see shade.glsl
-const SMOOTH_FRAMES = 64;  // the first ones, which are shown smoothed over a tile, the second half less and less
-// Where the sequences of a frame begin, so that its points follow those of the frame before.
-const randomOf = (frame, points) => R4.map((step) => fraction(0.5 + points * frame * step));
-const smoothingOf = (frame) => Math.min(Math.max(2 - (2 * frame) / SMOOTH_FRAMES, 0), 1);
 const fraction = (x) => x - Math.floor(x);
+
+// Where on the lamp the light of a frame comes from, -1 to 1 along its axes.
+function placeOf(state, frame) {
+  const [x, y] = R2.map((step) => fraction(0.5 + frame * step));
+  const [radius, phi] = [Math.sqrt(x), 2 * Math.PI * y];
+  return lightSizeOf(state).uLightIsDisc ? [radius * Math.cos(phi), radius * Math.sin(phi)] : [2 * x - 1, 2 * y - 1];
+}
 
 // One of the two shaders: its program, its uniforms, and the mean of its frames. A frame is drawn in bands of rows, so
 // that a slow shader blocks neither the page nor the device.
@@ -69,8 +68,9 @@ class Renderer {
     this.mesh = new Program(gl, SHADERS.mesh_vertex, SHADERS.scales, SHADERS.mesh);
     this.screen = new Program(gl, SHADERS.quad_vertex, SHADERS.ground, SHADERS.display);
     const constants = (state) => this.constants(state);
-    this.model = new Side(gl, SHADERS.model + SHADERS.radiance_model, constants, (state, frame) => this.modelUniforms(state, frame));
+    this.model = new Side(gl, SHADING + SHADERS.model + SHADERS.radiance_model, constants, (state, frame) => this.modelUniforms(state, frame));
     this.programs = new Map();
+    this.colours = new Colours(this);
     this.coil = tables.coil;
     this.noFootprint = numbers2D(gl, new Float32Array(1), 1, 1, 1);
     this.empty = gl.createVertexArray();
@@ -89,8 +89,10 @@ class Renderer {
     if (this.shader) this.shader.dispose();
     this.shader = null;
     if (variant === null) return;
-    const text = `#define VARIANT ${VARIANTS[variant]}\n${SHADERS.model}${SHADERS.shader_2014}`;
-    this.shader = new Side(this.gl, text, (state) => this.constants(state), (state) => ({ ...shader2014.uniforms(state), uMatching: this.matching }));
+    const text = `#define VARIANT ${VARIANTS[variant]}\n${SHADING}${SHADERS.model}${SHADERS.shader_2014}`;
+    this.shader = new Side(this.gl, text, (state) => this.constants(state), (state, frame) => ({
+      ...shader2014.uniforms(state), uMatching: this.matching, uPlace: placeOf(state, frame),
+    }));
     this.shader.resize(this.width, this.height);
   }
 
@@ -98,12 +100,12 @@ class Renderer {
   constants(state) {
     const { uLightIsDisc, uLightSize } = lightSizeOf(state);
     const light = Math.max(...uLightSize) === 0 ? 0 : uLightIsDisc ? 1 : 2;
-    return `${this.spectrum.constants(state)}const int LIGHT = ${light};\n`;
+    return `${this.colours.constants(state)}${this.spectrum.constants(state)}const int LIGHT = ${light};\n`;
   }
 
   // A program of model.glsl and other text, which are kept.
   programOf(state, ...text) {
-    const whole = [this.constants(state), SHADERS.model, ...text].join("\n");
+    const whole = [this.constants(state), SHADING, SHADERS.model, ...text].join("\n");
     if (!this.programs.has(whole)) this.programs.set(whole, new Program(this.gl, SHADERS.quad_vertex, whole));
     return this.programs.get(whole);
   }
@@ -111,11 +113,10 @@ class Renderer {
   modelUniforms(state, frame) {
     return {
       ...this.spectrum.uniforms(state),
-      ...wavelengthsOf(state, this.spectrum.materials[state.material], fraction(0.5 + frame * GOLDEN)),
-      uMatching: this.matching,
+      ...this.colours.uniforms(),
       uSky: state.sky / Math.PI,
-      uNodes: this.spectrum.nodes,
-      uNodeCount: this.spectrum.nodeCount,
+      uFirst: frame,
+      uBase: state.hasBase && state.material === "dielectric" ? colourOfPigment(state.pigment) : [0, 0, 0],
     };
   }
 
@@ -199,7 +200,6 @@ class Renderer {
       uLight: towardsLight(state),
       uPlate: plateOf(state),
       uLightSize: lightSizeOf(state).uLightSize,
-      uRandom: randomOf(frame, TILE_POINTS),
       uSin: Math.sin(turn),
       uCos: Math.cos(turn),
     });
@@ -258,8 +258,6 @@ class Renderer {
       uScreen: [gl.drawingBufferWidth, gl.drawingBufferHeight],
       uMean: this.model.mean.textures[0],
       uOther: other,
-      uSmooth: smoothingOf(this.model.frame),
-      uOtherSmooth: isPicture ? 0 : smoothingOf((this.shader || this.model).frame),
       uScale: this.scale,
       uOtherScale: isPicture ? pictureScale(picture, width, height) : [this.scale, this.scale, 0, 0],
       uOtherIsPicture: Number(isPicture),
@@ -280,7 +278,7 @@ class Renderer {
     const uMean = numbers2D(gl, Float32Array.from([...xyz, 1]), 1, 1, 4);
     this.screen.use({
       ...this.groundUniforms(state), uHasGround: 0, uScreen: [1, 1],
-      uMean, uOther: uMean, uSmooth: 0, uOtherSmooth: 0, uScale: 1, uOtherScale: [1, 1, 0, 0], uOtherIsPicture: 0,
+      uMean, uOther: uMean, uScale: 1, uOtherScale: [1, 1, 0, 0], uOtherIsPicture: 0,
       uExposure: 0.8 / Math.max(...toRGB(xyz), 1e-30), uOtherExposure: 1, uDivider: 1e6, uDifference: 0, uBackground: [0, 0, 0],
     });
     this.quad();
@@ -323,21 +321,17 @@ class Renderer {
     return Float32Array.from({ length: pairs.length / 7 }, (_, i) => values[4 * i]);
   }
 
-  // XYZ under parallel light for pairs, as above without lambda in use, the mean of some frames: (n, 4).
-  evaluateColours(state, pairs, frames) {
-    const program = this.programOf(state, SHADERS.radiance_model, SHADERS.pairs_model);
-    const mean = new Float64Array((4 * pairs.length) / 7);
-    for (let frame = 0; frame < frames; frame++) {
-      const values = this.evaluate(program, { ...this.modelUniforms(state, frame), uRandom: randomOf(frame, POINTS) }, pairs);
-      for (let i = 0; i < mean.length; i++) mean[i] += values[i] / frames;
-    }
-    return mean;
+  // XYZ under parallel light for pairs, as above without lambda in use: (n, 4).
+  evaluateColours(state, pairs) {
+    while (!this.colours.isReady) this.colours.prepare(state, Infinity);
+    const parallel = { ...state, lightWidth: 0, lightLength: 0, sky: 0 };
+    return this.evaluate(this.programOf(parallel, SHADERS.radiance_model, SHADERS.pairs_model), this.modelUniforms(parallel, 0), pairs);
   }
 
   // Linear RGB of the shader of 2014 for pairs, as above: (n, 4).
   evaluateShader(shader2014, state, pairs) {
     const program = this.programOf(state, `#define VARIANT ${VARIANTS[state.right]}`, SHADERS.shader_2014, SHADERS.pairs_2014);
-    return this.evaluate(program, { ...shader2014.uniforms(state), uMatching: this.matching }, pairs);
+    return this.evaluate(program, { ...shader2014.uniforms(state), uMatching: this.matching, uPlace: [0, 0] }, pairs);
   }
 
   evaluate(program, uniforms, pairs) {

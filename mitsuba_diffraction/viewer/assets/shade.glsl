@@ -8,27 +8,9 @@ uniform vec3 uEye;
 uniform vec3 uLight;                // to the light
 uniform float uPlate;               // height of the plate above the wall that is seen; zero where the surface is seen
 uniform vec2 uLightSize;            // of LIGHT, parallel (0), a disc (1) or a strip (2): half its width and half its length at distance one
-uniform vec4 uRandom;               // of this frame
 uniform float uSin;                 // of the angle from the tangent to the pattern's x axis
 uniform float uCos;
 out vec4 oMean;
-
-// omega_i of a point of the light, -1 to 1 along its axes; w is the solid angle of the elements there relative to the
-// middle.
-vec4 lightTo(vec2 place) {
-  vec3 d = lightAxes * vec3(place, 1.0);
-  float cosine = inversesqrt(dot(d, d));
-  return vec4(d * cosine, cosine * cosine * cosine);
-}
-
-// The n-th point of the light, a disc or a strip along the meridian.
-vec4 lightAt(int n) {
-  if (LIGHT == 0) return vec4(lightAxes[2], 1.0);
-  vec2 u = fract(random.xy + float(n) * STEPS.xy);
-  vec2 place = 2.0 * u - 1.0;
-  if (LIGHT == 1) place = sqrt(u.x) * vec2(cos(6.28318531 * u.y), sin(6.28318531 * u.y));
-  return lightTo(place);
-}
 
 // XYZ of what the face of the coat mirrors: the light and the sky.
 vec3 mirrored(vec3 wo) {
@@ -57,13 +39,9 @@ void main() {
     facet.z = sqrt(1.0 - dot(facet, facet));
     vec3 width = normalize(cross(vec3(0.0, 0.0, 1.0), uLight));
     lightAxes = mat3(uLightSize.x * (width * frame), uLightSize.y * (cross(uLight, width) * frame), uLight * frame);
-    // Interleaved sampling (Keller and Heidrich 2001): the pixels of a tile of 4 x 4 share the points of a frame, the
-    // same ones in every tile, and means over 4 x 4 pixels (display.glsl) have no noise.
-    ivec2 row = at & 1, half_ = (at >> 1) & 1;
-    tilePlace = 4 * (2 * (row.x ^ row.y) + row.y) + 2 * (half_.x ^ half_.y) + half_.y;
-    random = fract(uRandom + float(16 * tilePlace) * STEPS);
     vec3 wo = normalize(uPlate > 0.0 ? position.xyz - vec3(0.0, 0.0, uPlate) : uEye - position.xyz) * frame;
-    vec3 xyz = wo.z > 0.0 ? mirrored(wo) : vec3(0.0);
+    vec3 xyz = vec3(0.0);
+    if (wo.z > 0.0 && uCoat > 1.0) xyz = mirrored(wo);
     if (position.w == 1.0) xyz += radiance(wo);
     // A white wall receives cos^2/r^2, r the plate's height over the cosine; the back of the plate is black.
     if (uPlate > 0.0) xyz *= position.z > 0.5 * uPlate ? 0.0 : wo.z * wo.z * wo.z * wo.z;

@@ -25,9 +25,7 @@ uniform float uBrightness;             // of the diffraction alone; one for radi
 const float FIRST = 380.0, LAST = 780.0, STEP = 5.0;  // nm
 const int COUNT = 81;
 
-mat3 lightAxes;  // along them: half the width, half the length, and the direction of the light
-vec4 random;     // of this pixel and frame
-vec4 lightAt(int n);
+uniform vec2 uPlace;                   // of the lamp in this frame, -1 to 1 along its axes
 
 struct Pair {
   vec3 uvw;
@@ -288,7 +286,9 @@ vec3 shaderRGB(vec3 wi, vec3 wo) {
 
 // XYZ of what an sRGB screen shows.
 vec3 radiance(vec3 wo) {
-  vec4 light = lightAt(0);
+  vec3 d = lightAxes * vec3(uPlace, 1.0);
+  float cosine = inversesqrt(dot(d, d));
+  vec4 light = vec4(d * cosine, cosine * cosine * cosine);  // and the solid angle there relative to the middle
   vec3 rgb = light.w * shaderRGB(light.xyz, wo);
   vec3 below = vec3(0.0);
   if (HAS_BASE && light.z > 0.0 && wo.z > 0.0) {

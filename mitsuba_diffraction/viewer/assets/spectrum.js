@@ -71,43 +71,11 @@ function floatsOf({ values, type }) {
   return Float32Array.from(values, (bits) => halves[bits]);
 }
 
-// Weights of the nodes of a table, the mean of their power over kappa, and how to draw them by Vose's alias method (1991):
-// (probability, alias, weight, 0) of each.
-function nodesOf(table) {
-  const [layers, terms, rows, columns] = table.shape;
-  const count = rows * columns;
-  const values = floatsOf(table);
-  const weights = new Float64Array(count);
-  for (let layer = 0; layer < layers; layer++) {
-    for (let i = 0; i < count; i++) weights[i] += Math.abs(values[layer * terms * count + i]);
-  }
-  const total = weights.reduce((a, b) => a + b, 0) / count || 1;
-  const nodes = new Float32Array(4 * count);
-  const [small, large] = [[], []];
-  for (let i = 0; i < count; i++) {
-    nodes[4 * i + 2] = weights[i] / (total * count);
-    weights[i] /= total;
-    (weights[i] < 1 ? small : large).push(i);
-  }
-  while (small.length && large.length) {
-    const [low, high] = [small.pop(), large[large.length - 1]];
-    nodes.set([weights[low], high], 4 * low);
-    weights[high] -= 1 - weights[low];
-    if (weights[high] < 1) small.push(large.pop());
-  }
-  for (const i of [...small, ...large]) nodes.set([1, i], 4 * i);
-  return nodes;
-}
-
 class Spectrum {
   constructor(gl, spectrum, table, materials) {
     Object.assign(this, { gl, spectrum, materials });
     const [layers, terms, rows, columns] = table.shape;
-    this.nodeCount = rows * columns;
-    const [width, height] = [Math.min(this.nodeCount, 2048), Math.ceil(this.nodeCount / 2048)];
-    const nodes = new Float32Array(4 * width * height);
-    nodes.set(nodesOf(table));
-    this.nodes = numbers2D(gl, nodes, width, height, 4);
+    this.table = { values: floatsOf(table), layers, terms, nodes: rows * columns };
     const padded = interleaved(table.values, table.shape);
     this.texture = numbers3D(gl, padded, columns + 2 * MARGIN, rows + 2 * MARGIN, layers, terms);
     this.bytes = padded.byteLength;
@@ -116,20 +84,30 @@ class Spectrum {
   }
 
   kindOf(lobes, sigma) {
-    if (this.spectrum.kind === "splines") return KINDS.splines;
     const isLine = this.spectrum.max_order.includes(0);
     const single = lobes.every((lobe) => lobe.count === 1);
     if (single && !(isLine && sigma > MAX_DRAWN_LOBE_WIDTH)) return KINDS.resolved;
     return isLine ? KINDS.lines : KINDS.window;
   }
 
+  kindAt(state) {
+    const sigma = lobeWidth(state.coherenceLength);
+    return this.spectrum.kind === "splines" ? KINDS.splines : this.kindOf(lobesOf(this.spectrum, sigma), sigma);
+  }
+
+  // The power of a node at kappa.
+  powerAt(node, kappa) {
+    const { values, layers, terms, nodes } = this.table;
+    const x = Math.min((kappa * layers) / this.spectrum.max_kappa, layers);
+    const layer = Math.min(Math.floor(x), layers - 1), t = 2 * (x - layer) - 1;
+    return Array.from({ length: terms }, (_, p) => values[(layer * terms + p) * nodes + node] * t ** p).reduce((a, b) => a + b);
+  }
+
   // The constants of model.glsl.
   constants(state) {
     const metal = state.material in this.materials;
     const dielectric = state.material === "dielectric";
-    const splines = this.spectrum.kind === "splines";
-    const sigma = lobeWidth(splines ? this.spectrum.coherence_length : state.coherenceLength);
-    return `const int KIND = ${this.kindOf(splines ? null : lobesOf(this.spectrum, sigma), sigma)};
+    return `const int KIND = ${this.kindAt(state)};
 const int MATERIAL = ${dielectric ? 0 : metal ? 1 : 2};
 const bool CUBIC = ${this.terms === 4}, HAS_BASE = ${state.hasBase && dielectric};
 `;
@@ -156,7 +134,6 @@ const bool CUBIC = ${this.terms === 4}, HAS_BASE = ${state.hasBase && dielectric
       uLimit: splines ? spectrum.limit : [0, 0],
       uHeightScale: state.heightScale,
       uMinCosine: Math.cos((spectrum.largest_angle * Math.PI) / 180) * (1 - 1e-6),
-      uShadowing: 1,
       uCoat: Math.max(state.coat / state.air, 1),
       uEta: state.index / state.coat,
       uIndex: metal ? metal.texture : this.noIndex,
@@ -165,7 +142,6 @@ const bool CUBIC = ${this.terms === 4}, HAS_BASE = ${state.hasBase && dielectric
   }
 }
 
-const WAVELENGTHS = 48;  // of a frame, as in radiance_model.glsl
 const [FIRST, LAST] = [380, 740];  // nm
 
 // A table of `components` numbers at each nm from 360.
@@ -175,19 +151,24 @@ function at(table, components, nm, k) {
   return low + (nm - 360 - below) * (table[components * (below + 1) + k] - low);
 }
 
-// The wavelengths of a frame, shifted by `offset` (0 to 1), as uniforms of radiance_model.glsl.
-function wavelengthsOf(state, metal, offset) {
-  const step = (LAST - FIRST) / WAVELENGTHS;
-  const [spectrum, indices, pigment] = [[], [], [0, 0, 0]];
-  const [a, b, c] = state.hasBase ? pigmentOf(state.pigment) : [0, 0, 0];
-  for (let j = 0; j < WAVELENGTHS; j++) {
-    const nm = FIRST + step * (j + offset);
-    const weight = step * at(matching, 4, nm, 3);
-    const xyz = [0, 1, 2].map((k) => weight * at(matching, 4, nm, k));
-    const x = (a * nm + b) * nm + c;
-    xyz.forEach((value, k) => { pigment[k] += value * (0.5 + (0.5 * x) / Math.sqrt(1 + x * x)); });
-    spectrum.push(...xyz, nm);
+// Wavelengths of the visible spectrum, equidistant, as uniforms of table.glsl.
+function wavelengthsOf(state, metal, count) {
+  const step = (LAST - FIRST) / count;
+  const [spectrum, indices] = [[], []];
+  for (let j = 0; j < count; j++) {
+    const nm = FIRST + step * (j + 0.5);
+    spectrum.push(...[0, 1, 2].map((k) => step * at(matching, 4, nm, 3) * at(matching, 4, nm, k)), nm);
     indices.push(...(metal ? [0, 1].map((k) => at(metal.values, 2, nm, k) / state.coat) : [1, 0]));
   }
-  return { uSpectrum: spectrum, uIndices: indices, uPigmentColour: pigment };
+  return { uSpectrum: spectrum, uIndices: indices };
+}
+
+// XYZ of the pigment under the light.
+function colourOfPigment(hex) {
+  const [a, b, c] = pigmentOf(hex), sum = [0, 0, 0];
+  for (let nm = FIRST; nm < LAST; nm++) {
+    const x = (a * nm + b) * nm + c, part = matching[4 * (nm - 360) + 3] * (0.5 + (0.5 * x) / Math.sqrt(1 + x * x));
+    for (let k = 0; k < 3; k++) sum[k] += part * matching[4 * (nm - 360) + k];
+  }
+  return sum;
 }

@@ -1,5 +1,4 @@
-import type { Node, UniformNode } from 'three/webgpu';
-import { MeshStandardNodeMaterial } from 'three/webgpu';
+import { MeshStandardMaterial } from 'three';
 
 /** The colours of a surface, of a file by `mitsuba-diffraction export SURFACE -o NAME.bin`. */
 export class DiffractionData {
@@ -16,6 +15,8 @@ export class DiffractionData {
   readonly base: string;
   /** Index of the clear layer above; 1 of none. */
   readonly coat: number;
+  /** Values of the uniforms of `shadingOf`. */
+  readonly uniforms: Record<string, unknown>;
 }
 
 /** Load a file of colours; null, and one message in the console, if it cannot be read. */
@@ -26,22 +27,18 @@ export interface DiffractionMaterialParameters {
   orientation?: number | 'radial' | 'tangential';
   /** Whether the pattern turns about the middle of the texture coordinates, as on discs. */
   radial?: boolean;
-  /** Directions of the environment map in which overlapping orders are looked up, at most 256; default 64. */
+  /** Directions of the environment map in which overlapping orders are looked up, at most 512; default 64. */
   skyPoints?: number;
-  /** Parameters of MeshStandardNodeMaterial: color (the base), envMap, side, emissive, opacity, … */
+  /** Factor of the heights, of separate orders; default 1. */
+  heightScale?: number;
+  /** Parameters of MeshStandardMaterial: color (the base), envMap, side, emissive, opacity, … */
   [parameter: string]: unknown;
 }
 
 /** A mesh with a diffracting surface and texture coordinates; of null it is grey. */
-export class DiffractionMaterial extends MeshStandardNodeMaterial {
+export class DiffractionMaterial extends MeshStandardMaterial {
   constructor(data: DiffractionData | null, parameters?: DiffractionMaterialParameters);
-  /** Radians. */
-  orientation: UniformNode<'float', number>;
 }
 
-/** The BRDF as nodes, of directions in the frame of the pattern. */
-export class DiffractionBRDF {
-  constructor(data: DiffractionData);
-  /** f cos θ_i as XYZ under D65, the mean over a round lamp of an angular radius (radians). */
-  evaluate(wi: Node<'vec3'>, wo: Node<'vec3'>, radius?: Node<'float'> | null): Node<'vec3'>;
-}
+/** GLSL of f for the data of a surface: ofLamp(c, a, b, isDisc, wo) is f cos θ_i as XYZ under D65, see shading.js. */
+export function shadingOf(data: DiffractionData): string;
