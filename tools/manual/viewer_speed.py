@@ -26,7 +26,7 @@ from mitsuba_diffraction.render import render
 from mitsuba_diffraction.variants import choose_variant
 
 SIZE, SPP = 128, 128
-CONTROLS = 330  # pixels beside the picture
+VIEWPORT = {"width": 960, "height": 560}
 NAMES = {"none": "this model", "flss": "FLSS", "nmm": "NMM", "pq": "PQ", "nmm_pq": "NMM with PQ", "gem": "GEM"}
 TICKS = os.sysconf("SC_CLK_TCK")
 
@@ -62,7 +62,11 @@ def measured(surface: str) -> dict[str, tuple[float, float]]:
     """Return milliseconds and mean ΔE00 of each shader."""
     found: dict[str, tuple[float, float]] = {}
     recipe = SURFACES[surface][1]
-    with opened(surface, viewport={"width": SIZE + CONTROLS, "height": SIZE}) as tab:
+    with opened(surface, viewport=VIEWPORT) as tab:
+        style = f"{{ width: '{SIZE}px', height: '{SIZE}px', inset: 'auto' }}"
+        tab.evaluate(f"Object.assign(document.getElementById('canvas').style, {style})")
+        while tab.evaluate("viewer.renderer.height") != SIZE:
+            tab.wait_for_timeout(100)
         state = {"shape": "sphere", "lightWidth": 0, "lightLength": 0, "sky": 0, "hasBase": False, "difference": True}
         draw(tab, {**state, "right": "none"}, 4)
         scene = tab.evaluate("viewer.scene()").replace(f'"{Path(recipe).stem}"', f'"{RECIPES / recipe}"')
