@@ -21,6 +21,7 @@ from mitsuba_diffraction import cli, progress
 
 import drjit as dr  # isort: skip
 from bsdf_support import use  # isort: skip
+from mitsuba_diffraction.precomputation.grating_spectrum import GratingSpectrum
 from mitsuba_diffraction.render import passes
 
 # One example may be the first to import or to compile something.
@@ -34,6 +35,9 @@ _HEIGHT_RANGE = {"elaphe": 0.375, "xenopeltis": 0.819}
 """µm, black to white."""
 _TAKES_LONG = {"mi", "Furnace", "NotebookClient", "subprocess"}
 """What test modules import whose tests compile kernels, trace light in a furnace or start Python anew."""
+
+_OF_BSDFS = {"bsdf", "energy", "integrator"}
+"""Folders of tests."""
 
 
 def pytest_addoption(parser):
@@ -95,10 +99,28 @@ def one_thread_of_blas():
 def one_thread_of_dr_jit(request):
     """Compute with one thread in Dr.Jit, as well, where Mitsuba reads and writes no EXR picture, which then hangs."""
     threads = dr.thread_count()
-    if request.path.parent.name in ("bsdf", "energy", "integrator"):
+    if request.path.parent.name in _OF_BSDFS:
         dr.set_thread_count(1)
     yield
     dr.set_thread_count(threads)
+
+
+@pytest.fixture(scope="module", autouse=True)
+def spectra_are_not_cached(request, cache_folder):
+    """Leave spectra of profiles out of the cache where BSDFs are tested: its files have E, which few of them use.
+
+    E takes up to thirty times as long as S.
+    """
+    save = GratingSpectrum.save
+
+    def saved_elsewhere(spectrum, path, recipe=""):
+        if Path(path).parent != cache_folder:
+            save(spectrum, path, recipe)
+
+    with pytest.MonkeyPatch.context() as patch:
+        if request.path.parent.name in _OF_BSDFS:
+            patch.setattr(GratingSpectrum, "save", saved_elsewhere)
+        yield
 
 
 @pytest.fixture(scope="session", autouse=True)

@@ -49,6 +49,8 @@ BY_OTHER_MEANS = (
     *("python tools/", "python scenes/"),
 )
 """Commands that CI runs, and the tests of notebooks, the manual, the benchmark, the validation and the gallery."""
+SMALL_DISC = {"patches": 1, "tracks": 5, "length": 16.0, "tolerance": 0.05}
+"""Parameters of a disc of which few pits and a rough table will do."""
 NUMBER = re.compile(r"(?<![\w.])[-−]?\d+(?:\.\d*)?(?:e[-+]?\d+)?")
 
 
@@ -144,8 +146,8 @@ def run_toml(text):
 def run_xml(text):
     # Instead of the mean over many patches a small one will do, and a rough table.
     disc = '<string name="profile" value="compact_disc"/>'
-    small = {"integer": {"patches": 1, "tracks": 5}, "float": {"length": 16, "tolerance": 0.05}}
-    of_disc = (f'<{kind} name="{k}" value="{v}"/>' for kind, values in small.items() for k, v in values.items())
+    kinds = {int: "integer", float: "float"}
+    of_disc = (f'<{kinds[type(v)]} name="{k}" value="{v}"/>' for k, v in SMALL_DISC.items())
     text = text.replace(disc, "".join([disc, *of_disc]))
     Path("block.xml").write_text(f'<scene version="3.0.0">{text}</scene>')
     mi.load_file("block.xml")
@@ -158,7 +160,7 @@ def run_xml(text):
 )
 def test_the_code_of_a_page_runs(page, folder, command, llvm, capfd, monkeypatch):
     if page.stem == "README":
-        monkeypatch.setattr(md, "example_scene", partial(md.example_scene, size=16))
+        monkeypatch.setattr(md, "example_scene", partial(md.example_scene, size=16, **SMALL_DISC))
     names = {}
     parts = list(blocks(page))
     for (language, text), (following, shown) in zip(parts, [*parts, ("", "")][1:], strict=True):
