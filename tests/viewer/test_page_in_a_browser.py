@@ -661,7 +661,7 @@ def test_the_sky_is_that_of_a_path_tracer(source, parameters, changes, opened, t
     """The picture of `view.xml` without a lamp: the mean XYZ of a plate, whose orders see other parts of the sky."""
     tab = opened(Surface.named(source, parameters))
     view = {"shape": "plate", "azimuth": -70, "elevation": 35, "distance": 2, "lightElevation": -80}
-    tab.evaluate("(changes) => viewer.set(changes)", {"maxFrames": 32, "sky": 0.5, "hasBase": False, **view, **changes})
+    tab.evaluate("(changes) => viewer.set(changes)", {"maxFrames": 64, "sky": 0.5, "hasBase": False, **view, **changes})
     wait_for_frames(tab)
     width, height = tab.evaluate("viewer.renderer.drawn")
     mean = np.array(tab.evaluate("Array.from(viewer.renderer.readMean().values)")).reshape(height, width, 4)

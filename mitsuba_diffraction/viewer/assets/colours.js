@@ -94,7 +94,7 @@ class Colours {
 
   ofOrders(state) {
     const { gl } = this;
-    const [uGaussians, uRelative, uMirror] = [[CENTRES, WIDTHS], [COSINES, COSINES], [DISTANCES, COSINES]].map(([width, height], k) => {
+    const [uGaussians, uRatios, uMirror] = [[CENTRES, WIDTHS], [COSINES, COSINES], [DISTANCES, COSINES]].map(([width, height], k) => {
       const made = texture(gl, gl.TEXTURE_2D);
       gl.texStorage2D(gl.TEXTURE_2D, 1, gl.RGBA16F, width, height);
       this.draw(state, k + 1, 90, [width, height], {}, () =>
@@ -103,7 +103,7 @@ class Colours {
     });
     const perNu = 2 * Math.PI * 0.8 * this.rangeW(state)[1] * state.heightScale;
     const drawn = drawnOfOrders((order, nu) => this.spectrum.powerAt(order, perNu * nu), this.spectrum.spectrum.max_order);
-    return { uGaussians, uRelative, uMirror, uDrawn: numbers2D(gl, drawn, SAMPLES, 1, 4) };
+    return { uGaussians, uRatios, uMirror, uDrawn: numbers2D(gl, drawn, SAMPLES, 1, 4) };
   }
 
   // A part of table.glsl.

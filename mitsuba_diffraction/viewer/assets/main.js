@@ -1,6 +1,6 @@
 // Starts the page.
 
-const MAX_FRAMES = 32;
+const MAX_FRAMES = 64;
 const EXPOSED_FRAMES = [1, 4];  // after which the exposure is found
 const BUDGET_MILLISECONDS = 80;  // of drawing between two turns of the page
 const LAMP_DISTANCE = 1.2;

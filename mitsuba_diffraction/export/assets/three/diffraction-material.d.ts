@@ -27,7 +27,7 @@ export interface DiffractionMaterialParameters {
   orientation?: number | 'radial' | 'tangential';
   /** Whether the pattern turns about the middle of the texture coordinates, as on discs. */
   radial?: boolean;
-  /** Directions of the environment map in which overlapping orders are looked up, at most 512; default 64. */
+  /** Directions of the environment map in which overlapping orders are looked up, at most 256; default 64. */
   skyPoints?: number;
   /** Factor of the heights, of separate orders; default 1. */
   heightScale?: number;

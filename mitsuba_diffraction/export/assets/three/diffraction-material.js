@@ -4,9 +4,10 @@ import {
   DataArrayTexture, DataTexture, DataUtils, FloatType, HalfFloatType, LinearFilter, LinearMipmapLinearFilter,
   MeshStandardMaterial, NearestFilter, RGBAFormat, ShaderChunk, Vector2,
 } from 'three';
-import { SAMPLES, SHADING, drawnOfTable } from './shading.js';
+import { SHADING, drawnOfTable } from './shading.js';
 
 const VERSION = 2;
+const SAMPLES = 256;  // of a sky, by a table
 const [LOW, HIGH, WAVELENGTHS, MAX_ORDERS] = [1000 / 740, 1000 / 380, 12, 170];  // a texture has 2048 texels
 const FROM_RADIUS = { radial: 0, tangential: 90 };
 
@@ -44,7 +45,7 @@ export class DiffractionData {
     const uColours = new DataArrayTexture(halves, size, size, layers);
     Object.assign(uColours, { format: RGBAFormat, type: HalfFloatType, magFilter: LinearFilter });
     Object.assign(uColours, { minFilter: LinearMipmapLinearFilter, generateMipmaps: true, needsUpdate: true });
-    return { uColours, uStretch: this.stretch, uDrawn: loaded(drawnOfTable(sums, size, this.stretch), SAMPLES, 1) };
+    return { uColours, uStretch: this.stretch, uDrawn: loaded(drawnOfTable(sums, size, this.stretch, SAMPLES), SAMPLES, 1) };
   }
 
   #orders({ frequencies, powers, light, reflectance, mirror }) {
@@ -68,7 +69,7 @@ export class DiffractionData {
       uPowers: loaded(all, columns, rows), uMaxKappa: this.max_kappa, uSigma: this.lobe_width,
       uPerPitch: new Vector2(...T), uMaxOrder: new Vector2(M, N), uDrawn: loaded(sky, count, 1),
       uGaussians: interpolated(light.values, light.shape[1], light.shape[0], 3),
-      uRelative: interpolated(reflectance.values, reflectance.shape[1], reflectance.shape[0], 1),
+      uRatios: interpolated(reflectance.values, reflectance.shape[1], reflectance.shape[0], 1),
       uMirror: interpolated(scaled, mirror.shape[1], mirror.shape[0], 3),
     };
   }

@@ -104,7 +104,7 @@ float layerOf(float w) {
 #ifdef ORDERS
 
 uniform highp sampler2D uGaussians;     // of a Gaussian of light, over its middle c and its width s, in 1/um
-uniform highp sampler2D uRelative;  // R relative to that at normal incidence, over nu and cos theta_h
+uniform highp sampler2D uRatios;  // R relative to that at normal incidence, over nu and cos theta_h
 uniform highp sampler2D uMirror;    // C of order 0 times 2 pi sigma_q^2, over |u|/sigma_q and w
 const float MAX_CENTRE = 4.0, NARROW = 3e-3, WIDE = 30.0, MAX_MIRROR = 6.0 * 0.74;
 const float CUTOFF = 4.0;  // of lobes, in standard deviations
@@ -118,7 +118,7 @@ vec3 look(highp sampler2D map, float x, float y) {
 }
 
 float relative(vec2 u, float w, float nu) {
-  return look(uRelative, (nu - LOW) / (HIGH - LOW), min(0.5 * length(vec3(u, w)) / uCoat, 1.0)).r;
+  return look(uRatios, (nu - LOW) / (HIGH - LOW), min(0.5 * length(vec3(u, w)) / uCoat, 1.0)).r;
 }
 
 // p C^-1 q for a matrix (A, B; B, C), times its determinant.
@@ -258,8 +258,10 @@ vec3 ofSky(vec3 wo, int first, int count) {
   for (int k = 0; k < count; k++) {
     vec4 drawn = texelFetch(uDrawn, ivec2((first + k) % all, 0), 0);
 #ifdef ORDERS
-    float nu = drawn.z, area = 1e-3;
-    vec2 u = drawn.xy / (uPerPitch * nu);
+    float nu = drawn.z, area = 1e-3, place = float(first + k), turn = 2.0 * PI * fract(0.56984029 * place);
+    // A point of its lobe.
+    vec2 offset = uSigma * sqrt(-2.0 * log(1.0 - fract(0.5 + 0.75487767 * place))) * vec2(cos(turn), sin(turn));
+    vec2 centre = drawn.xy / (uPerPitch * nu), u = centre + offset / nu;
 #else
     float area = 1.0 / (drawn.z * float(count));
     vec2 u = drawn.xy;
@@ -272,7 +274,7 @@ vec3 ofSky(vec3 wo, int first, int count) {
 #ifdef ORDERS
       ivec2 m = ivec2(round(drawn.xy));
       float power = orderPower(m, 2.0 * PI * w * nu * uHeightScale) * relative(u, w, nu) * drawn.w / float(count);
-      power *= kG(vec2(wi.z * wi.z, wo.z * wo.z), dot(u, u)) / sqrt(2.0 * PI);
+      power *= orderFactor(wi, wo, centre, nu / uSigma) / sqrt(2.0 * PI);
       vec3 XYZ = look(uGaussians, nu / MAX_CENTRE, 0.0) * power;  // the narrowest row is the light at nu
 #else
       vec3 XYZ = coloursOf(wi, wo, vec3(0.0)) * area;
@@ -285,21 +287,21 @@ vec3 ofSky(vec3 wo, int first, int count) {
 `;
 
 const MAX_U = 2;
-export const SAMPLES = 512;  // of a sky
+export const SAMPLES = 1024;  // of a sky, of many frames
 const [LOW, HIGH, STEPS] = [1000 / 740, 1000 / 380, 48];
 
 // Items drawn by their weights in equal steps of their sum; the first ones, too, are spread out.
-function drawn(weights, itemOf) {
-  const found = new Float32Array(4 * SAMPLES), total = weights.reduce((a, b) => a + b, 0);
-  for (let n = 0, k = 0, sum = weights[0]; n < SAMPLES; n++) {
-    while (k < weights.length - 1 && sum < ((n + 0.5) / SAMPLES) * total) sum += weights[++k];
-    found.set(itemOf(k, weights[k] / total), 4 * ((n * 101) % SAMPLES));
+function drawn(weights, itemOf, count = SAMPLES) {
+  const found = new Float32Array(4 * count), total = weights.reduce((a, b) => a + b, 0);
+  for (let n = 0, k = 0, sum = weights[0]; n < count; n++) {
+    while (k < weights.length - 1 && sum < ((n + 0.5) / count) * total) sum += weights[++k];
+    found.set(itemOf(k, weights[k] / total), 4 * ((n * 101) % count));
   }
   return found;
 }
 
 /** uDrawn of a table, from X + Y + Z of its middle layer. */
-export function drawnOfTable(sums, size, stretch) {
+export function drawnOfTable(sums, size, stretch, count) {
   const edge = Math.asinh(MAX_U / stretch), x = (k) => edge * ((2 * k) / (size - 1) - 1);
   const node = (k) => stretch * Math.sinh(x(k)), width = (k) => (stretch * Math.cosh(x(k)) * edge * 2) / (size - 1);
   const at = (k) => [k % size, Math.floor(k / size)];
@@ -310,7 +312,7 @@ export function drawnOfTable(sums, size, stretch) {
   return drawn(weights, (k, part) => {
     const [i, j] = at(k);
     return [node(i), node(j), part / (width(i) * width(j)), 0];
-  });
+  }, count);
 }
 
 /** uDrawn of orders, from their powers (row, nu) for a common pair of directions, rows over m_y. */
