@@ -245,9 +245,10 @@ def test_a_rectangle_lights_by_its_area(name, exported, tab):
     inside = (np.abs(points[:, :2]) < 0.9).all(axis=1)
     found, wanted = (found @ SRGB_TO_XYZ.T)[inside], mixed(wanted)[inside]
     error = difference(found, wanted)
-    assert error.mean() < 2
-    assert np.percentile(error, 95) < 6
-    assert found.sum() == pytest.approx(wanted.sum(), rel=0.05)
+    assert error.mean() < 1
+    assert np.percentile(error, 95) < 5
+    # Not within 3 %: soft edges leave less in the few pixels of the image of the lamp.
+    assert found.sum() == pytest.approx(wanted.sum(), rel=0.06)
 
 
 @pytest.mark.slow

@@ -175,7 +175,7 @@ const float MAX_DISC_PARTS = 7.0;
 
 // How many parts of a lamp are taken along half of a length.
 float partsOf(float size, vec2 u) {
-  return min(ceil(size * 1.8 / uSigma), 4.0);
+  return min(ceil(size * 1.8 / uSigma), 6.0);
 }
 
 #else
