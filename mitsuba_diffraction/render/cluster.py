@@ -3,12 +3,13 @@
 Each band of a pass is a task. A worker loads the scene once per rendering and traces one task at a time with all of its
 threads. Results are added in the order of the passes, so that the sum is identical, bit for bit, to the sum on a single
 machine. At most two tasks per initial worker are in flight. Dask reassigns the tasks of a lost worker; where all are
-lost, others are waited for. A worker with other versions or files is left out.
+lost, others are waited for. A worker with other versions or files, or without the package, is left out.
 """
 
 from __future__ import annotations
 
 import asyncio
+import importlib.util
 import logging
 import math
 import threading
@@ -18,6 +19,7 @@ from collections.abc import Generator, Iterator
 from concurrent import futures
 from contextlib import contextmanager, suppress
 from functools import lru_cache
+from importlib.machinery import ModuleSpec
 from typing import TYPE_CHECKING
 
 import drjit as dr
@@ -35,6 +37,7 @@ if TYPE_CHECKING:
 _log = logging.getLogger(__name__)
 # Held while a pass is traced: it uses all threads of Dr.Jit, and two at a time would only need more memory.
 pass_lock = threading.Lock()
+PACKAGE = __name__.partition(".")[0]
 CONNECT_TIMEOUT = 30  # seconds
 MAX_PASSES_PER_WORKER = 2  # in flight
 SECONDS_WITHOUT_WORKERS, SECONDS_BETWEEN_LOOKS = 30.0, 1.0  # until a warning; at the workers
@@ -87,8 +90,9 @@ class _Tasks:
 
     def __init__(self, client: distributed.Client, job: Job, first: int) -> None:
         self.client, self.job, self.first = client, job, first
-        self.waiting: deque[distributed.Future] = deque()
-        self.unsuitable: set[str] = set()  # addresses of workers
+        self.waiting: deque[tuple[distributed.Future, set[str]]] = deque()  # with the workers that may trace it
+        self.suitable: set[str] = set()  # addresses of workers
+        self.unsuitable: set[str] = set()
         self.thread = futures.ThreadPoolExecutor(1)
 
     def __enter__(self) -> _Tasks:
@@ -100,27 +104,33 @@ class _Tasks:
         self.thread.shutdown(wait=False)
 
     def cancel(self) -> None:
-        self.client.cancel(list(self.waiting), force=True)
+        self.client.cancel([task for task, _ in self.waiting], force=True)
         self.waiting.clear()
 
     def results(self, address: str) -> Generator[NDArray[np.float32] | None, None, None]:
         """Yield the results of all tasks in order; while there are no workers, None."""
-        workers, total = self._workers(), len(self.job.samples) * len(self.job.bands)
+        total = len(self.job.samples) * len(self.job.bands)
+        workers = self._workers()
+        if not workers and self.unsuitable:
+            raise RuntimeError(f"no worker of {address} has the package {PACKAGE}")
         max_waiting, since, result, is_first = MAX_PASSES_PER_WORKER * len(workers), time.monotonic(), None, True
         while self.first < total:
+            if workers and self.waiting and not workers & self.waiting[0][1]:
+                self.cancel()
+                result = None
             while workers and len(self.waiting) < max_waiting and self.first + len(self.waiting) < total:
-                index, on = self.first + len(self.waiting), sorted(workers) if self.unsuitable else None
-                self.waiting.append(self.client.submit(_trace_on_worker, self.job, index, pure=False, workers=on))
+                index = self.first + len(self.waiting)
+                task = self.client.submit(_trace_on_worker, self.job, index, pure=False, workers=sorted(workers))
+                self.waiting.append((task, workers))
             # In a thread, as what takes long to arrive must not be requested again.
             if self.waiting and result is None:
-                result = self.thread.submit(self.waiting[0].result)
-            if result is None or not futures.wait([result], SECONDS_BETWEEN_LOOKS).done:
-                before, workers = workers, self._workers()
+                result = self.thread.submit(self.waiting[0][0].result)
+            arrived = result is not None and bool(futures.wait([result], SECONDS_BETWEEN_LOOKS).done)
+            workers = self._workers()
+            if workers or arrived:
+                since = time.monotonic()
+            if result is None or not arrived:
                 if workers:
-                    since = time.monotonic()
-                    if self.unsuitable and workers != before:
-                        self.cancel()
-                        result = None
                     continue
                 if time.monotonic() - since > SECONDS_WITHOUT_WORKERS:
                     _log.warning("the Dask scheduler at %s has no workers left; waiting for others", address)
@@ -129,16 +139,14 @@ class _Tasks:
                     time.sleep(SECONDS_BETWEEN_LOOKS)
                 yield None
                 continue
-            since = time.monotonic()
             try:
                 traced = result.result()
             except Unsuitable as error:
                 where, reason = error.args
-                self.unsuitable.add(where)
-                workers = self._workers()
+                self._leave_out(where, reason)
+                workers = workers - self.unsuitable
                 if is_first and not workers:
                     raise RuntimeError(reason) from None
-                _log.warning("the worker at %s is left out: %s", where, reason)
                 self.cancel()
             else:
                 self.waiting.popleft()
@@ -150,7 +158,20 @@ class _Tasks:
     def _workers(self) -> set[str]:
         """Return the addresses of the workers that may suit the job."""
         threads: dict[str, int] = self.client.sync(self.client.scheduler.ncores, callback_timeout=CONNECT_TIMEOUT)
-        return set(threads) - self.unsuitable
+        # A worker without the package could not read its task, and would end instead of saying so.
+        if new := set(threads) - self.suitable - self.unsuitable:
+            found = self.client.run(importlib.util.find_spec, PACKAGE, workers=sorted(new), on_error="return")
+            for where, spec in found.items():
+                if isinstance(spec, ModuleSpec):
+                    self.suitable.add(where)
+                elif not isinstance(spec, OSError):
+                    self._leave_out(where, f"it lacks the package {PACKAGE}")
+        return set(threads) & self.suitable
+
+    def _leave_out(self, where: str, reason: str) -> None:
+        self.suitable.discard(where)
+        self.unsuitable.add(where)
+        _log.warning("the worker at %s is left out: %s", where, reason)
 
 
 class Unsuitable(RuntimeError):

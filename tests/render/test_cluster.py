@@ -73,12 +73,20 @@ def with_light_from_gratings(scene):
     return scene.replace('"path"', '"diffraction_path"').replace("</scene>", f'{sun}<shape type="rectangle"/></scene>')
 
 
+def with_a_folder(scene):
+    """The same, whose sphere is in a file of a folder that the scene names."""
+    start, end = scene.index("<shape"), scene.index("</shape>") + len("</shape>")
+    Path("parts").mkdir()
+    Path("parts/sphere.xml").write_text(f'<scene version="3.0.0">{scene[start:end]}</scene>')
+    return f'{scene[:start]}<path value="parts"/><include filename="sphere.xml"/>{scene[end:]}'
+
+
 @pytest.mark.slow
 @pytest.mark.few(1)
 @pytest.mark.parametrize("scene", [SCENE, with_light_from_gratings(SCENE)], ids=["path", "diffraction_path"])
 @pytest.mark.parametrize("processes", [1, 2], indirect=True)
 def test_a_cluster_gives_the_bits_of_one_machine(scene, processes, command):
-    Path("scene.xml").write_text(scene)
+    Path("scene.xml").write_text(with_a_folder(scene))
     line = (
         f"render scene.xml -o out.exr --float --spp 9 --variant llvm_ad_spectral --dask {processes.scheduler_address}"
     )
@@ -267,6 +275,40 @@ def test_a_late_worker_of_another_version_is_left_out(invented_passes, monkeypat
     assert image.attributes["spp"] == 40
     messages = {record.getMessage() for record in caplog.records if record.name == cluster.__name__}
     assert messages == {f"the worker at {late} is left out: a worker has mitsuba 2.0; wanted {', '.join(known)}"}
+
+
+WORKER_WITHOUT_PACKAGE = """import sys
+sys.modules["mitsuba_diffraction"] = None
+sys.path[:] = [folder for folder in sys.path if folder]
+from distributed.cli.dask_worker import main
+main([sys.argv[1], "--no-nanny", "--no-dashboard", "--nthreads", "1"])"""
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("late", [True, False])
+def test_a_worker_without_the_package_is_left_out(late, invented_passes, caplog):
+    with start(n_workers=1 if late else 0, processes=False, protocol="tcp") as local, contextlib.ExitStack() as ends:
+        first = workers_of(local.scheduler_address)
+
+        def join(done=3, *others):
+            if done == 3:
+                call = [sys.executable, "-c", WORKER_WITHOUT_PACKAGE, local.scheduler_address]
+                worker = subprocess.Popen(call, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
+                ends.callback(worker.wait)
+                ends.callback(worker.kill)
+                with distributed.Client(local.scheduler_address, set_as_default=False) as client:
+                    client.wait_for_workers(len(first) + 1, timeout=120)
+
+        if late:
+            image = render("scene.xml", spp=40, tracer=trace_on(local.scheduler_address), progress=join)
+            assert image.attributes["spp"] == 40
+            (without,) = workers_of(local.scheduler_address) - first
+            messages = [record.getMessage() for record in caplog.records if record.name == cluster.__name__]
+            assert messages == [f"the worker at {without} is left out: it lacks the package mitsuba_diffraction"]
+        else:
+            join()
+            with pytest.raises(RuntimeError, match=r"no worker of tcp://.* has the package mitsuba_diffraction"):
+                render("scene.xml", spp=40, tracer=trace_on(local.scheduler_address))
 
 
 @pytest.mark.slow
