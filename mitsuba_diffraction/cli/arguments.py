@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
+import functools
+import inspect
 import os
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
+from dataclasses import MISSING, fields
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated, Any, TypeVar, get_type_hints
 
 import numpy as np
 import typer
@@ -17,6 +20,8 @@ from ..files.writing import refuse_other_than_utf8
 from ..precomputation.requested_surface import RequestedSurface
 from ..precomputation.surface_text import absolute
 from ..progress import say
+
+Request = TypeVar("Request")
 
 _MAX_VALUES = 10_000  # of a range first:last:step
 
@@ -43,6 +48,31 @@ KEYS_OF_RECIPES = (
     "extent, coherence_length, tolerance"
 )
 Variant = Annotated[str | None, typer.Option(help="Mitsuba variant; default: the fastest spectral one")]
+
+
+def as_command(kind: type[Request]) -> Callable[[Callable[[Request], None]], Callable[..., None]]:
+    """Make a function of a request a command, whose arguments and options are the fields of the data class `kind`."""
+    hints = get_type_hints(kind, include_extras=True)
+    parameters = [
+        inspect.Parameter(
+            field.name,
+            inspect.Parameter.POSITIONAL_OR_KEYWORD,
+            default=inspect.Parameter.empty if field.default is MISSING else field.default,
+            annotation=hints[field.name],
+        )
+        for field in fields(kind)  # type: ignore[arg-type]
+    ]
+
+    def decorate(run: Callable[[Request], None]) -> Callable[..., None]:
+        @functools.wraps(run)
+        def command(**options: Any) -> None:
+            run(kind(**options))
+
+        command.__signature__ = inspect.Signature(parameters)  # type: ignore[attr-defined]
+        command.__annotations__ = hints
+        return command
+
+    return decorate
 
 
 @contextmanager

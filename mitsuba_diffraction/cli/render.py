@@ -5,7 +5,9 @@ from __future__ import annotations
 import logging
 import math
 import time
+from collections.abc import Mapping
 from contextlib import suppress
+from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
@@ -16,7 +18,16 @@ from ..errors import RequestError
 from ..files.outputs import check_outputs, free_name
 from ..machine import available_memory
 from ..progress import bytes_text, durations, progress_bar, say, stage, takes_long, tell, time_text
-from .arguments import Define, Overwrite, Variant, check_suffix, materials_of, named_as_options, scene_parameters
+from .arguments import (
+    Define,
+    Overwrite,
+    Variant,
+    as_command,
+    check_suffix,
+    materials_of,
+    named_as_options,
+    scene_parameters,
+)
 
 if TYPE_CHECKING:
     import mitsuba as mi
@@ -35,67 +46,70 @@ class Stopped(Exception):
     """Interruption by Ctrl-C or SIGTERM after something has been saved; the text names it."""
 
 
-def render(
-    scene: Annotated[Path, typer.Argument(metavar="SCENE.xml")],
+@dataclass(frozen=True)
+class RenderRequest:
+    """What `render` was asked for: its arguments and options."""
+
+    scene: Annotated[Path, typer.Argument(metavar="SCENE.xml")]
     output: Annotated[
         Path | None,
         typer.Option(
             "-o", "--output", help="spectral picture (.exr), or the preview alone (.png, .jpg); default: ./SCENE.exr"
         ),
-    ] = None,
+    ] = None
     spp: Annotated[
         int | None,
         typer.Option(
             min=1, help="samples per pixel, the maximum with --until-error; default: sample_count of the scene, or 64"
         ),
-    ] = None,
-    width: Annotated[int | None, typer.Option(min=1, help="pixels; default: that of the scene")] = None,
-    height: Annotated[int | None, typer.Option(min=1, help="pixels; default: that of the scene")] = None,
-    variant: Variant = None,
-    seed: Annotated[int, typer.Option(min=0, help="seed of the random numbers")] = 0,
-    define: Define = None,
+    ] = None
+    width: Annotated[int | None, typer.Option(min=1, help="pixels; default: that of the scene")] = None
+    height: Annotated[int | None, typer.Option(min=1, help="pixels; default: that of the scene")] = None
+    variant: Variant = None
+    seed: Annotated[int, typer.Option(min=0, help="seed of the random numbers")] = 0
+    define: Define = None
     material: Annotated[
         list[str] | None,
         typer.Option(
             metavar="ID=SURFACE[,name=value…]",
             help="replace the BSDF of this id by a grating: a recipe, profile or spectrum; name=value: its parameters",
         ),
-    ] = None,
+    ] = None
     until_error: Annotated[
         float | None, typer.Option(metavar="ERROR", help="stop at this relative standard error of luminance, e.g. 0.01")
-    ] = None,
-    resume: Annotated[bool, typer.Option("--resume", help="resume an interrupted run of the same command")] = False,
-    checkpoint: Annotated[float, typer.Option(min=0, metavar="SECONDS", help="interval between checkpoints")] = 60,
+    ] = None
+    resume: Annotated[bool, typer.Option("--resume", help="resume an interrupted run of the same command")] = False
+    checkpoint: Annotated[float, typer.Option(min=0, metavar="SECONDS", help="interval between checkpoints")] = 60
     single: Annotated[
         bool, typer.Option("--float", help="write float32; default: float16, unless it rounds by more than 0.05 %")
-    ] = False,
-    rgb: Annotated[
-        bool, typer.Option("--rgb", help="write only R, G, B, as float16: at most 6 bytes per pixel")
-    ] = False,
+    ] = False
+    rgb: Annotated[bool, typer.Option("--rgb", help="write only R, G, B, as float16: at most 6 bytes per pixel")] = (
+        False
+    )
     channels: Annotated[
         int | None,
         typer.Option(min=2, metavar="N", help="write at most N wavelengths (46, 30, 22, …), each over a wider band"),
-    ] = None,
+    ] = None
     exposure: Annotated[
         float | None,
         typer.Option(min=-99, max=99, metavar="STOPS", help="multiply the preview by 2^STOPS; default: automatic"),
-    ] = None,
+    ] = None
     view: Annotated[
         str | None,
         typer.Option(
             metavar="NAME",
             help="preview by a filmic view of OpenColorIO, such as ACES or, with Blender's $OCIO, AgX (extra: ocio)",
         ),
-    ] = None,
+    ] = None
     denoise: Annotated[
         bool | None,
         typer.Option(
             help="denoise the preview, but not the spectral picture (extra: denoise); default: as in the scene, or no"
         ),
-    ] = None,
+    ] = None
     dask: Annotated[
         str | None, typer.Option(metavar="ADDRESS", help="distribute the passes over a Dask cluster (tcp://HOST:PORT)")
-    ] = None,
+    ] = None
     # 3600 frames are a tenth of a degree apart, and last five minutes.
     frames: Annotated[
         int | None,
@@ -105,21 +119,102 @@ def render(
             metavar="N",
             help="pictures of an animation: of --orbit, or of values first:last (-D turn=0:90)",
         ),
-    ] = None,
-    orbit: Annotated[bool, typer.Option("--orbit", help="with --frames, move the camera around the scene")] = False,
-    overwrite: Overwrite = False,
-) -> None:
+    ] = None
+    orbit: Annotated[bool, typer.Option("--orbit", help="with --frames, move the camera around the scene")] = False
+    overwrite: Overwrite = False
+
+    def __post_init__(self) -> None:
+        if self.rgb and self.channels is not None:
+            raise RequestError("--rgb writes no wavelengths: wanted --rgb or --channels N")
+        if self.output is not None:
+            check_suffix("-o", self.output, ".exr", ".png", ".jpg")
+            options = {"--float": self.single, "--rgb": self.rgb, "--channels": self.channels is not None}
+            if not _is_spectral(self.output) and any(options.values()):
+                named = ", ".join(option for option, given in options.items() if given)
+                raise RequestError(f"{named}: how an .exr is stored; got {self.output}, a picture of eight bits")
+        if self.orbit and self.frames is None:
+            raise RequestError("--orbit: wanted --frames N with it")
+
+    @property
+    def stored(self) -> dict[str, Any]:
+        """How an .exr is stored: arguments of `SpectralImage.save`."""
+        return {"half": False if self.single else None, "rgb": self.rgb, "channels": self.channels}
+
+    def _parameters(self) -> tuple[dict[str, str], str | None]:
+        """Return the parameters of the scene, and that of denoising, where nothing else refers to it."""
+        from ..render.denoise import default_of
+
+        parameters = scene_parameters(self.define)
+        # Mitsuba refuses a parameter that nothing refers to.
+        given = parameters.pop("denoise", None) if self.scene.is_file() and default_of(self.scene) else None
+        return parameters, given
+
+    def denoises(self) -> bool:
+        """Return whether the preview is denoised: as requested, or as in the scene if the denoiser is installed."""
+        from ..render.denoise import is_requested
+
+        if self.denoise is not None:
+            return self.denoise
+        return is_requested(self.scene, self._parameters()[1]) and _can_denoise()
+
+    def scene_files(self) -> list[SceneFile]:
+        """Return the scene of each frame."""
+        from ..render.animation import frames_of
+        from ..render.scene_file import SceneFile
+
+        size = self.width, self.height
+        scene_file = SceneFile(self.scene, self._parameters()[0], materials_of(self.material), size)
+        if self.frames is None:
+            return [scene_file]
+        frames = frames_of(scene_file, self.frames)
+        if not self.orbit and frames[0] == frames[-1]:
+            raise RequestError("--frames N: wanted --orbit, or a value that changes, such as -D turn=0:90")
+        return frames
+
+    def target(self, reads: list[Path]) -> Path:
+        """Return the path of the picture, or the path from which those of an animation are named, if all is free.
+
+        Args:
+            reads: files that the command reads.
+        """
+        from ..render.sums import checkpoint_path
+
+        named = free_name(self.scene.stem, lambda stem: _outputs(Path(f"{stem}.exr"), self.frames), reads)
+        target = self.output or Path(named + ".exr")
+        check_outputs(reads, [("-o", path) for path in _outputs(target, self.frames)], overwrite=self.overwrite)
+        checkpoints = [path for path in map(checkpoint_path, _pictures(target, self.frames)) if path.exists()]
+        if checkpoints and not self.resume:
+            raise RequestError(
+                f"{checkpoints[0]} is of an unfinished rendering: --resume continues it; remove it to start over"
+            )
+        return target
+
+
+@dataclass(frozen=True)
+class _Rendering:
+    """What all pictures of a command have in common.
+
+    Attributes:
+        request: of the command.
+        arguments: of `passes.render`, for the first picture.
+        denoise: the preview.
+        view: of the preview.
+    """
+
+    request: RenderRequest
+    arguments: Mapping[str, Any]
+    denoise: bool
+    view: ViewTransform
+
+
+@as_command(RenderRequest)
+def render(request: RenderRequest) -> None:
     """Path-trace a scene into a spectral picture (.exr) with a preview (.png), or into a picture alone (.png, .jpg)."""
     from ..optics.color import neutral_view, ocio_view
 
     # Before Mitsuba, which takes more than a second to start.
-    stored = {"half": False if single else None, "rgb": rgb, "channels": channels}
-    _check_output(output, stored)
     with named_as_options({"view": "--view"}):
-        shown = neutral_view if view is None else ocio_view(view)
-    if orbit and frames is None:
-        raise RequestError("--orbit: wanted --frames N with it")
-
+        shown = neutral_view if request.view is None else ocio_view(request.view)
     if (available := available_memory()) is not None and available < _MIN_MEMORY:
         raise RequestError(
             f"memory: got {bytes_text(available)} that are available, wanted at least {bytes_text(_MIN_MEMORY)}"
@@ -127,76 +222,71 @@ def render(
 
     import mitsuba as mi
 
-    from ..render.animation import animations_of, frames_of, save_animation
-    from ..render.animation import orbit as motions_of_orbit
-    from ..render.cluster import trace_on
-    from ..render.denoise import default_of, is_requested
-    from ..render.passes import deferred_interrupt, trace_locally
-    from ..render.scene_file import SceneFile
     from ..render.scene_materials import check_materials
-    from ..render.sums import checkpoint_path
     from ..variants import choose_variant
 
-    parameters = scene_parameters(define)
-    # Mitsuba refuses a parameter that nothing refers to.
-    given = parameters.pop("denoise", None) if scene.is_file() and default_of(scene) else None
-    scene_file = SceneFile(scene, parameters, materials_of(material), (width, height))
-    scene_files = [scene_file] if frames is None else frames_of(scene_file, frames)
-    if frames is not None and not orbit and scene_files[0] == scene_files[-1]:
-        raise RequestError("--frames N: wanted --orbit, or a value that changes, such as -D turn=0:90")
-    scene_file = scene_files[0]
-    reads = [*scene_file.files(), *scene_files[-1].files()]
-    target = output or Path(free_name(scene.stem, lambda stem: _outputs(Path(f"{stem}.exr"), frames), reads) + ".exr")
-    check_outputs(reads, [("-o", path) for path in _outputs(target, frames)], overwrite=overwrite)
-    checkpoints = [path for path in map(checkpoint_path, _pictures(target, frames)) if path.exists()]
-    if checkpoints and not resume:
-        raise RequestError(
-            f"{checkpoints[0]} is of an unfinished rendering: --resume continues it; remove it to start over"
-        )
-    mi.set_variant(choose_variant(variant))
-    if denoise is None:
-        denoise = is_requested(scene, given) and _can_denoise()
-    named = None if spp else scene_file.sample_count()
-    spp = spp or named or 64
-    tracer = trace_locally if dask is None else trace_on(dask)
+    scene_files = request.scene_files()
+    target = request.target([*scene_files[0].files(), *scene_files[-1].files()])
+    mi.set_variant(choose_variant(request.variant))
+    denoise = request.denoises()
+    arguments = _arguments(request, scene_files[0], target)
     with scene_files[-1].parsed():  # before all others are rendered
         check_materials(scene_files[-1].materials)
-    motions = motions_of_orbit(scene_file, len(scene_files)) if orbit else [None] * len(scene_files)
+    _render_all(_Rendering(request, arguments, denoise, shown), scene_files, target)
+
+
+def _arguments(request: RenderRequest, scene_file: SceneFile, target: Path) -> dict[str, Any]:
+    """Return the arguments of `passes.render` for a scene; `target` is the picture."""
+    from ..render.cluster import trace_on
+    from ..render.passes import trace_locally
+
+    named = None if request.spp else scene_file.sample_count()
+    tracer = trace_locally if request.dask is None else trace_on(request.dask)
     alpha = scene_file.has_alpha()
     if alpha and target.suffix.lower() == ".jpg":
         raise RequestError(f"-o: got {target}, but the scene has alpha, which JPEG has not; wanted .exr or .png")
-    request: dict[str, Any] = {"spp": spp, "seed": seed, "until_error": until_error}
-    request |= {"seconds": checkpoint, "tracer": tracer}
-    if until_error is None:  # else nobody knows the time
-        written = channels if _is_spectral(target) and not rgb else 0
-        size = 1 if not _is_spectral(target) else 4 if single and not rgb else 2
-        request["announce"] = partial(_announce, scene.name, size, 3 + alpha, written, named)
-    pictures = _pictures(target, frames)
+    arguments: dict[str, Any] = {"spp": request.spp or named or 64, "seed": request.seed}
+    arguments |= {"until_error": request.until_error, "seconds": request.checkpoint, "tracer": tracer}
+    if request.until_error is None:  # else nobody knows the time
+        written = request.channels if _is_spectral(target) and not request.rgb else 0
+        size = 1 if not _is_spectral(target) else 4 if request.single and not request.rgb else 2
+        arguments["announce"] = partial(_announce, request.scene.name, size, 3 + alpha, written, named)
+    return arguments
+
+
+def _render_all(rendering: _Rendering, scene_files: list[SceneFile], target: Path) -> None:
+    """Render the picture of a command, or those of its animation."""
+    from ..render.animation import animations_of, save_animation
+    from ..render.animation import orbit as motions_of_orbit
+    from ..render.passes import deferred_interrupt
+
+    request, scene = rendering.request, rendering.request.scene.name
+    count = len(scene_files)
+    motions = motions_of_orbit(scene_files[0], count) if request.orbit else [None] * count
+    pictures = _pictures(target, request.frames)
     # By default all pictures have the exposure of the first.
-    factor = None if exposure is None else 2**exposure
+    factor = None if request.exposure is None else 2**request.exposure
     with durations(), named_as_options({"until_error": "--until-error", "spp": "--spp"}):
         for number, (path, frame, motion) in enumerate(zip(pictures, scene_files, motions, strict=True)):
             begin = time.perf_counter()
             factor = _picture(
+                rendering,
                 frame.viewed(motion=motion),
                 path,
-                request,
-                resume=resume,
-                stored=stored,
-                denoise=denoise,
-                view=shown,
-                label=scene.name if len(pictures) == 1 else f"{scene.name} {number + 1}/{len(pictures)}",
+                label=scene if count == 1 else f"{scene} {number + 1}/{count}",
                 exposure=factor,
-                complete=f"{number} of {len(pictures)} pictures are complete" if number else None,
+                complete=f"{number} of {count} pictures are complete" if number else None,
             )
-            if number == 0 and not resume:
-                _announce_others(scene.name, len(pictures) - 1, time.perf_counter() - begin)
-            request.pop("announce", None)
-        if frames is not None:
+            if number == 0:
+                if not request.resume:
+                    _announce_others(scene, count - 1, time.perf_counter() - begin)
+                others = {name: value for name, value in rendering.arguments.items() if name != "announce"}
+                rendering = replace(rendering, arguments=others)
+        if request.frames is not None:
             with deferred_interrupt():
                 for animation in animations_of(target):
                     save_animation([_preview(path) for path in pictures], animation)
-                    tell(f"{animation}: animated preview, {frames} frames")
+                    tell(f"{animation}: animated preview, {request.frames} frames")
 
 
 def _announce(
@@ -243,19 +333,6 @@ def _can_denoise() -> bool:
     return False
 
 
-def _check_output(output: Path | None, stored: dict[str, Any]) -> None:
-    """Check the name of the picture, and whether the options of an EXR (`stored`) go with it and with each other."""
-    if stored["rgb"] and stored["channels"] is not None:
-        raise RequestError("--rgb writes no wavelengths: wanted --rgb or --channels N")
-    if output is None:
-        return
-    check_suffix("-o", output, ".exr", ".png", ".jpg")
-    options = {"--float": stored["half"] is False, "--rgb": stored["rgb"], "--channels": stored["channels"] is not None}
-    if not _is_spectral(output) and any(options.values()):
-        named = ", ".join(option for option, given in options.items() if given)
-        raise RequestError(f"{named}: how an .exr is stored; got {output}, a picture of eight bits")
-
-
 def _is_spectral(path: Path) -> bool:
     """Return whether a picture is to be stored spectrally; if not, its preview is all that is written."""
     return path.suffix.lower() == ".exr"
@@ -286,14 +363,10 @@ def _outputs(target: Path, frames: int | None) -> list[Path]:
 
 
 def _picture(
+    rendering: _Rendering,
     scene_file: SceneFile,
     path: Path,
-    request: dict[str, Any],
     *,
-    resume: bool,
-    stored: dict[str, Any],
-    denoise: bool,
-    view: ViewTransform,
     label: str,
     exposure: float | None,
     complete: str | None,
@@ -301,32 +374,34 @@ def _picture(
     """Render, save and report one picture; return the exposure of its preview, if it is known.
 
     Args:
-        request: the other arguments of `passes.render`.
-        stored: arguments of `SpectralImage.save`.
-        view: of the preview.
+        rendering: of the command.
+        scene_file: of this picture.
+        path: of this picture.
+        label: of its progress.
         exposure: of the preview; None: `auto_exposure`.
         complete: number of completed pictures, as text to report if Ctrl-C interrupts this one.
     """
     from ..render.denoise import check_requirements, denoised_picture
     from ..render.passes import Finished, Interrupted, deferred_interrupt
     from ..render.passes import render as trace
-    from ..render.spectral_image import exposure_of_preview, save_preview, stored_digest, wider_hats
+    from ..render.spectral_image import exposure_of_preview, save_preview, stored_digest
     from ..render.sums import checkpoint_path, discard_checkpoints
 
     start = time.perf_counter()
+    request, view, arguments = rendering.request, rendering.view, dict(rendering.arguments)
     checkpoint, preview = checkpoint_path(path), _preview(path)
-    earlier = stored_digest(path) if resume and path.is_file() and not checkpoint.exists() else None
+    earlier = stored_digest(path) if request.resume and path.is_file() and not checkpoint.exists() else None
     scenes: list[mi.Scene] = []
-    if denoise:
+    if rendering.denoise:
         with named_as_options({"denoise": "--denoise"}):
             check_requirements()
-        request = {**request, "on_load": partial(_keep, scenes)}
+        arguments["on_load"] = partial(_keep, scenes)
     interrupted = False
     try:
         with progress_bar(label, "spp", "loading and compiling") as progress:
             image = trace(
                 scene_file,
-                **request,
+                **arguments,
                 checkpoint=checkpoint,
                 finished=earlier,
                 progress=progress,
@@ -348,7 +423,7 @@ def _picture(
         try:
             if _is_spectral(path):
                 with stage("writing"):
-                    image.save(path, **stored)
+                    image.save(path, **request.stored)
             with stage("preview"):
                 clean = partial(denoised_picture, scenes[0]) if scenes else None
                 exposure = save_preview(image, preview, exposure, clean, view)
@@ -360,23 +435,26 @@ def _picture(
         spp = image.attributes["spp"]
         raise Stopped(f"{path} holds {spp} samples per pixel; the same command with --resume continues")
     discard_checkpoints(checkpoint)
-    channels = "8 bits"
-    if _is_spectral(path):
-        count = (
-            image.shape[2] if stored["channels"] is None else wider_hats(image.shape[2], stored["channels"]).shape[1]
-        )
-        channels = "RGB" if stored["rgb"] else f"{count} wavelengths"
-    exposed = (
-        "denoised, " if denoise else ""
-    ) + f"exposed by {(stops := math.log2(exposure)):+.2f} stops (--exposure {stops:.2f})"
-    tell(
-        f"{path}: {_summary(image, request['until_error'], channels)}, "
-        f"{time.perf_counter() - start:.1f} s, {bytes_text(path.stat().st_size)}"
-        + (f"\n{preview}: preview, {exposed}" if _is_spectral(path) else f", {exposed}")
-    )
+    tell(_report(rendering, image, path, exposure, time.perf_counter() - start))
     if pressed():
         raise Stopped(f"{path} is complete")
     return exposure
+
+
+def _report(rendering: _Rendering, image: SpectralImage, path: Path, exposure: float, seconds: float) -> str:
+    """Return what is printed of a picture that is complete."""
+    from ..render.spectral_image import wider_hats
+
+    request, channels = rendering.request, "8 bits"
+    if _is_spectral(path):
+        wanted, count = request.channels, image.shape[2]
+        count = count if wanted is None else wider_hats(count, wanted).shape[1]
+        channels = "RGB" if request.rgb else f"{count} wavelengths"
+    stops = math.log2(exposure)
+    exposed = ("denoised, " if rendering.denoise else "") + f"exposed by {stops:+.2f} stops (--exposure {stops:.2f})"
+    summary = _summary(image, request.until_error, channels)
+    text = f"{path}: {summary}, {seconds:.1f} s, {bytes_text(path.stat().st_size)}"
+    return text + (f"\n{_preview(path)}: preview, {exposed}" if _is_spectral(path) else f", {exposed}")
 
 
 def _keep(scenes: list[mi.Scene], scene: mi.Scene) -> None:
