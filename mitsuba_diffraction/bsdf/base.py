@@ -1,9 +1,8 @@
-"""The base under the surface, a nested BSDF; and construction of nested plugins."""
+"""The base under the surface, a nested BSDF; and gratings that are nested in others."""
 
 from __future__ import annotations
 
 import contextlib
-import functools
 import re
 import weakref
 from collections.abc import Iterator
@@ -16,24 +15,13 @@ import numpy as np
 
 from ..errors import RequestError, is_number
 from ..settings import VISIBLE
+from .mitsuba_internals import nested_plugin, parts
 
 _CHECKED = 32  # points along u and v at which a base is checked
 _MIN_SPECULAR = 0.04  # albedo of a base that reflects specularly, too, about that of a varnish
 
 living: weakref.WeakSet[mi.BSDF] = weakref.WeakSet()  # the gratings of all scenes
 left_out: ContextVar[bool] = ContextVar("left_out", default=False)  # whether gratings are evaluated as black
-
-
-def nested_plugin(kind: str, **parameters: object) -> mi.Object:
-    """Make a plugin without children.
-
-    mi.load_dict replaces Mitsuba's file resolver during the call, while other threads construct plugins that may use
-    it.
-    """
-    props = mi.Properties(kind)
-    for name, value in parameters.items():
-        props[name] = value
-    return mi.PluginManager.instance().create_object(props)
 
 
 @contextlib.contextmanager
@@ -60,29 +48,6 @@ def gratings_in(bsdf: mi.BSDF | None) -> list[mi.BSDF]:
     if bsdf is None:
         return []
     return [bsdf] * is_grating(bsdf) + [grating for part in parts(bsdf, mi.BSDF) for grating in gratings_in(part)]
-
-
-def parts(plugin: mi.Object, kind: type) -> list[Any]:
-    """Return the objects of a class that a plugin holds as parameters, such as both BSDFs of a `twosided`."""
-    callback = _collector()(kind)
-    plugin.traverse(callback)
-    return callback.found
-
-
-@functools.cache
-def _collector() -> type:
-    """Define the callback of `parts`, once: a class is a reference cycle, and keeps alive what its methods hold."""
-
-    class Collector(mi.TraversalCallback):
-        def __init__(self, kind: type) -> None:
-            mi.TraversalCallback.__init__(self)
-            self.kind, self.found = kind, list[Any]()
-
-        def put(self, name: str, value: object, *rest: object) -> None:
-            if isinstance(value, self.kind):
-                self.found.append(value)
-
-    return Collector
 
 
 def base_from(props: mi.Properties) -> Base | None:

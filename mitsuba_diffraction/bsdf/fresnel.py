@@ -12,10 +12,10 @@ from ..errors import RequestError
 from ..optics.film_stack import Stack
 from ..optics.materials import MAX_INDEX, MIN_INDEX, KnownRange, RefractiveIndex, constant, index_of, is_file
 from ..optics.media import DEFAULT_INT_IOR, Media, MediumBelow
-from .base import nested_plugin
 from .coat import Coat
 from .device_tables import opaque
 from .indices import Dispersion, check_spectra, index_from, known_spectrum, nodes_of
+from .mitsuba_internals import nested_plugin
 
 Cosines: TypeAlias = "mi.Float | mi.UnpolarizedSpectrum"
 

@@ -22,8 +22,8 @@ from ..optics.materials import (
     max_index,
 )
 from ..settings import VISIBLE
-from .base import nested_plugin, parts
 from .device_tables import PacketTable, integer_part, limited, on_device, opaque
+from .mitsuba_internals import nested_plugin, parts
 
 MAX_INDEX_NODES = 200_000  # 1 nm apart for tables that end at 200 µm
 _TRIED = 32  # points along u and v, at least, at which a texture of an index is checked

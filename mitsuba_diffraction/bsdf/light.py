@@ -9,8 +9,9 @@ import numpy as np
 from ..errors import RequestError
 from ..settings import VISIBLE
 from ..variants import is_supported
-from .base import gratings_in, parts
+from .base import gratings_in
 from .device_tables import on_device
+from .mitsuba_internals import parts
 
 STEP = 0.25  # nm, less than the width of lines
 

@@ -33,11 +33,12 @@ from ..settings import (
     wavelengths_inside,
 )
 from ..surface.gratings import PROFILES
-from .base import Base, base_from, nested_plugin
+from .base import Base, base_from
 from .coat import Coat
 from .device_tables import larger
 from .fresnel import Material, below_from, reflectance_from
 from .indices import index_from
+from .mitsuba_internals import nested_plugin
 from .thin_film import with_film
 from .varying import VaryingNumber, check_texture, numbers_from
 

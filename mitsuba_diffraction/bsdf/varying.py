@@ -12,7 +12,7 @@ import numpy as np
 
 from ..errors import RequestError, is_number
 from ..files.picture_file import IN_TEXTURE, check_picture
-from .base import nested_plugin
+from .mitsuba_internals import nested_plugin
 
 
 class VaryingNumber:

@@ -31,8 +31,18 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from ..bsdf.base import gratings_in, gratings_left_out, is_grating, parts
+from ..bsdf.base import gratings_in, gratings_left_out, is_grating
 from ..bsdf.device_tables import BELOW_ONE, on_device, opaque
+from ..bsdf.mitsuba_internals import (
+    BLEND,
+    BUMP_MAP,
+    DIFFUSE,
+    INSTANCE,
+    NORMAL_MAP,
+    ROUGH_CONDUCTOR,
+    TWO_SIDED,
+    parts,
+)
 from ..precomputation.grating_spectrum import GratingSpectrum
 from ..precomputation.spectra import Spectrum
 from ..spectrum.grids import OrderGrid
@@ -253,7 +263,7 @@ def _random(sequence: int) -> mi.Point3f:
 
 def _points_of_instances(scene: mi.Scene, u: mi.Point3f) -> mi.Point3f:
     """Map points of the unit cube to the boxes around all instances, as Mitsuba does not draw points on them."""
-    boxes = [shape.bbox() for shape in scene.shapes() if shape.class_name() == "Instance"]
+    boxes = [shape.bbox() for shape in scene.shapes() if shape.class_name() == INSTANCE]
     low, high = (
         mi.Point3f(*map(on_device, np.array(corners).T))
         for corners in zip(*((box.min, box.max) for box in boxes), strict=True)
@@ -270,11 +280,11 @@ def _marks_failure(bsdf: mi.BSDF) -> bool:
     only reflect, in which a direction below the horizon has no value.
     """
     name, nested = bsdf.class_name(), parts(bsdf, mi.BSDF)
-    if is_grating(bsdf) or name in ("RoughConductor", "SmoothDiffuse"):
+    if is_grating(bsdf) or name in (ROUGH_CONDUCTOR, DIFFUSE):
         return True
-    if name == "BlendBSDF" and bsdf.flags() & +mi.BSDFFlags.Transmission:
+    if name == BLEND and bsdf.flags() & +mi.BSDFFlags.Transmission:
         return False
-    return name in ("TwoSidedBRDF", "NormalMap", "BumpMap", "BlendBSDF") and all(map(_marks_failure, nested))
+    return name in (TWO_SIDED, NORMAL_MAP, BUMP_MAP, BLEND) and all(map(_marks_failure, nested))
 
 
 def _lattice_point(number: mi.Float, shift: mi.Point2f) -> mi.Point2f:

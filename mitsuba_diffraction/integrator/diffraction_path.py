@@ -7,8 +7,8 @@ from typing import Any
 import drjit as dr
 import mitsuba as mi
 
-from ..bsdf.base import nested_plugin
 from ..bsdf.light import is_black, recorded_wavelengths
+from ..bsdf.mitsuba_internals import camera_rays, nested_plugin
 from ..errors import RequestError
 from ..parameter_documentation import Parameter, listed
 from .eye_paths import EyeTracer, define_eye_paths
@@ -181,10 +181,7 @@ def _lit_gratings(scene: mi.Scene, sensor: mi.Sensor, max_depth: int, cache: Sce
 
 def _trace_eye_paths(scene: mi.Scene, sensor: mi.Sensor, eye: Any, seed: mi.UInt32 | int, spp: int) -> int:
     """Put paths from the eye into the film of a sensor; return the samples per pixel."""
-    # Mitsuba's rays, samplers and films of integrators in Python.
-    camera = nested_plugin("prb")
-    sampler, spp = camera.prepare(sensor, seed, spp)
-    ray, weight, position = camera.sample_rays(scene, sensor, sampler)
+    sampler, spp, ray, weight, position = camera_rays(scene, sensor, seed, spp)
     received, valid = eye.trace(scene, sampler, ray, weight)
     block = sensor.film().create_block()
     block.set_coalesce(block.coalesce() and spp >= 4)

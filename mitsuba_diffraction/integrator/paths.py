@@ -14,8 +14,9 @@ import mitsuba as mi
 import numpy as np
 from numpy.typing import NDArray
 
-from ..bsdf.base import gratings_in, gratings_left_out, is_grating, parts
+from ..bsdf.base import gratings_in, gratings_left_out, is_grating
 from ..bsdf.device_tables import on_device
+from ..bsdf.mitsuba_internals import INSTANCE, SHAPE_GROUP, TWO_SIDED, parts
 from .scene_cache import SceneCache
 
 
@@ -66,8 +67,8 @@ class Gratings:
         shapes = [shape for shape in scene.shapes() if gratings_in(shape.bsdf())]
         areas = cache.once("areas", lambda: _areas(scene, shapes))
         self.shapes = [shape for shape, area in zip(shapes, areas, strict=True) if area > 0]
-        has_instances = any(shape.class_name() == "Instance" for shape in scene.shapes())
-        groups = [shape for shape in parts(scene, mi.Shape) if shape.class_name() == "ShapeGroupPlugin"]
+        has_instances = any(shape.class_name() == INSTANCE for shape in scene.shapes())
+        groups = [shape for shape in parts(scene, mi.Shape) if shape.class_name() == SHAPE_GROUP]
         members = [shape for group in groups for shape in parts(group, mi.Shape) if has_instances]
         self.instanced = [shape for shape in members if gratings_in(shape.bsdf())]
         if self.shapes:
@@ -178,7 +179,7 @@ def _is_grating_only(bsdf: mi.BSDF) -> bool:
     components = parts(bsdf, mi.BSDF)
     if is_grating(bsdf):
         return not components
-    return bsdf.class_name() == "TwoSidedBRDF" and all(map(_is_grating_only, components))
+    return bsdf.class_name() == TWO_SIDED and all(map(_is_grating_only, components))
 
 
 def _kind_of(bsdf: mi.BSDF) -> int:

@@ -18,6 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..bsdf.device_tables import integer_part, larger, limited, on_device, opaque, smaller
+from ..bsdf.mitsuba_internals import DISK, RECTANGLE, SPHERE
 
 MAX_OUTLINES = 12
 MARGIN = 1.01  # of outlines, against rounding at their edges
@@ -28,7 +29,7 @@ _DRAWN = 2**16  # directions drawn from an environment: they find a sun between 
 _POINTS = 2**15  # at which the radiance of all lamps is evaluated
 _WAVELENGTHS = (450.0, 530.0, 590.0, 650.0)  # nm
 _BOX, _DISK, _SPHERE = range(3)
-_EXACT = {"Rectangle": _BOX, "Disk": _DISK, "Sphere": _SPHERE}
+_EXACT = {RECTANGLE: _BOX, DISK: _DISK, SPHERE: _SPHERE}
 
 
 class UnshadowedLight:
@@ -143,7 +144,7 @@ def _groups(bounds: NDArray[np.float64]) -> list[list[int]]:
 
 
 def _is_flat(lamps: list[mi.Shape]) -> bool:
-    return len(lamps) == 1 and lamps[0].class_name() in ("Rectangle", "Disk")
+    return len(lamps) == 1 and lamps[0].class_name() in (RECTANGLE, DISK)
 
 
 def _outline(lamps: list[mi.Shape]) -> tuple[int, NDArray[np.float64], NDArray[np.float64]]:

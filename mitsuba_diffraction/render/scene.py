@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 from ..bsdf.base import gratings_in
 from ..bsdf.device_tables import on_device
 from ..bsdf.light import cover_light, recorded_wavelengths
+from ..bsdf.mitsuba_internals import has_uvs
 from ..errors import RequestError
 from .parser_state import children_of
 from .scene_light import warn_of_light_from_below
@@ -70,11 +71,6 @@ def _warn_of_shapes(shapes: Sequence[mi.Shape], warning: str) -> None:
     bsdfs = [shape.bsdf() for shape in shapes]
     if names := sorted({bsdf.id() or "a BSDF" for bsdf in bsdfs if gratings_in(bsdf)}):
         _log.warning("%s: %s", ", ".join(names), warning)
-
-
-def has_uvs(mesh: mi.Shape) -> bool:
-    """Return whether a mesh has UVs; Mitsuba 3.10 renames the method."""
-    return mesh.has_texcoords() if hasattr(mesh, "has_texcoords") else mesh.has_vertex_texcoords()
 
 
 def shows_gratings(scene: mi.Scene, across: int = 1) -> NDArray[np.bool_]:

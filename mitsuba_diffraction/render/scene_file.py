@@ -21,6 +21,7 @@ import mitsuba as mi
 import mitsuba.parser
 import numpy as np
 
+from ..bsdf.mitsuba_internals import parser_config
 from ..errors import RequestError, did_you_mean, root_cause
 from ..files.picture_file import IN_ENVIRONMENT, IN_TEXTURE, check_picture
 from ..files.writing import examples_folder, refuse_other_than_utf8, whole_file
@@ -103,7 +104,7 @@ class SceneFile:
         folders = mi.FileResolver(mi.file_resolver())
         folders.prepend(str(path.resolve().parent))
         with self._searching(folders):
-            config = _config()
+            config = parser_config()
             check_nesting(path.resolve(), self.parameters)
             state = mi.parser.parse_file(config, str(path.resolve()), **self.parameters)
             resolved = mi.parser.ParserState(state)
@@ -138,7 +139,7 @@ class SceneFile:
         """
         _, state, folders = self._content
         with self._searching(folders):
-            yield _config(), mi.parser.ParserState(state)
+            yield parser_config(), mi.parser.ParserState(state)
 
     def files(self) -> list[Path]:
         """Return the files that the scene names: itself, included files, files of its plugins, scans of its recipes.
@@ -233,14 +234,6 @@ class SceneFile:
             )
         draw_wavelengths_of_lights(scene)
         return scene
-
-
-def _config() -> mi.parser.ParserConfig:
-    """Return the settings of the parser for the current variant, if there is one."""
-    config = mi.parser.ParserConfig(mi.variant() or "scalar_spectral")
-    # A merged mesh has no bounding box in Mitsuba 3.9.1.
-    config.merge_meshes = False
-    return config
 
 
 def _alternatives(scene: Path, error: str, parameters: Mapping[str, str]) -> str:

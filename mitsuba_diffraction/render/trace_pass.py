@@ -25,6 +25,7 @@ from numpy.typing import NDArray
 
 from ..bsdf.device_tables import on_device
 from ..bsdf.light import recorded_wavelengths
+from ..bsdf.mitsuba_internals import INDEPENDENT
 from ..errors import RequestError, root_cause
 from ..integrator.paths import LightPaths, random_numbers, unpacked
 from ..machine import available_memory
@@ -167,7 +168,7 @@ def max_samples(sampler: mi.Sampler, limit: int) -> int:
 
 def is_independent(sampler: mi.Sampler) -> bool:
     """Return whether no two numbers of a sampler are correlated."""
-    return sampler.class_name() == "IndependentSampler"
+    return sampler.class_name() == INDEPENDENT
 
 
 def rotated_sampler(sampler: mi.Sampler, seed: int, pixel: mi.UInt32) -> mi.Sampler:

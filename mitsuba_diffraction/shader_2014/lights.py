@@ -9,6 +9,7 @@ import mitsuba as mi
 import numpy as np
 from numpy.typing import NDArray
 
+from ..bsdf.mitsuba_internals import DIRECTIONAL, POINT
 from ..bsdf.testing import array, interaction
 from ..errors import RequestError
 from .tristimulus import wavelengths
@@ -30,11 +31,11 @@ class Light:
         spectrum: (401,) at `tristimulus.wavelengths`: normal irradiance per nm, for point lights at distance one.
     """
 
-    KINDS = ("DirectionalEmitter", "PointLight")
+    KINDS = (DIRECTIONAL, POINT)
 
     def __init__(self, emitter: mi.Emitter) -> None:
         self.emitter = emitter
-        self.at_point = emitter.class_name() == "PointLight"
+        self.at_point = emitter.class_name() == POINT
         # At distance one from a point light; directional light is uniform.
         origin = mi.Point3f(mi.traverse(emitter)["position"]) if self.at_point else mi.Point3f(0)
 

@@ -9,9 +9,10 @@ from dataclasses import dataclass
 import drjit as dr
 import mitsuba as mi
 
-from ..bsdf.base import gratings_in, is_grating, parts
+from ..bsdf.base import gratings_in, is_grating
 from ..bsdf.directions import rotated
 from ..bsdf.layers import Layers
+from ..bsdf.mitsuba_internals import parts
 from ..errors import RequestError
 from ..precomputation.recipe import Recipe
 from ..rigorous.rigorous_spectrum import RigorousSpectrum

@@ -10,9 +10,10 @@ import numpy as np
 import pytest
 from bsdf_support import made_up
 
+from mitsuba_diffraction.bsdf.mitsuba_internals import has_uvs
 from mitsuba_diffraction.cli.arguments import materials_of
 from mitsuba_diffraction.render import render
-from mitsuba_diffraction.render.scene import has_uvs, warn_of_gratings
+from mitsuba_diffraction.render.scene import warn_of_gratings
 from mitsuba_diffraction.render.scene_file import SceneFile
 
 MIRROR = {"profile": "blazed", "period": 2.0, "depth": 0.2, "material": "none", "conserve_energy": False}

@@ -20,7 +20,7 @@ import mitsuba as mi
 import numpy as np
 from numpy.typing import NDArray
 
-from ...bsdf.base import nested_plugin, parts
+from ...bsdf.mitsuba_internals import nested_plugin, parts
 from ...errors import RequestError
 from ...progress import Progress, silent
 from ...render.scene import instantiated, recorded_range
