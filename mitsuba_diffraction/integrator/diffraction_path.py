@@ -58,15 +58,15 @@ finds much of this light in the picture, to 64, where it finds little; the numbe
 `path`, a light without extent is not seen in a mirror: it is omitted where the grating next to it scatters by a delta
 component.
 
-Instances, curves, `sdfgrid` and `ellipsoids` count as X, and so do shapes on which rays do not find the points that
+Instances, curves and `sdfgrid` count as X, and so do shapes on which rays do not find the points that
 Mitsuba draws there, as on a sphere with a scale that is not uniform. Direct light at an instance is drawn as that at a
 grating.
 
-Without a grating, with max_depth of 0 or 1, in polarised variants, and for sensors other than `perspective` and
-`thinlens`, this is `path`. So it is with max_depth of 2 where all lights have an extent and are about as bright in all
-directions. hide_emitters, and films with sample_border, are refused.
-It can be nested in `aov`. Gradients are computed by `path` (forward) and `prb` (backward), single rays (`sample`) by
-`path`.
+Without a grating, with max_depth of 0 or 1, in polarised variants, with `ellipsoids` or `ellipsoidsmesh`, which rays of
+Mitsuba 3.9.1 meet from outside only, and for sensors other than `perspective` and `thinlens`, this is `path`. So it is
+with max_depth of 2 where all lights have an extent and are about as bright in all directions. hide_emitters, and films
+with sample_border, are refused. It can be nested in `aov`. Gradients are computed by `path` (forward) and `prb`
+(backward), single rays (`sample`) by `path`.
 """
 
 
@@ -157,6 +157,10 @@ def define() -> type:
     return DiffractionPath
 
 
+# Paths from the light would have other obstacles there than those from the eye.
+_MET_FROM_OUTSIDE = ("Ellipsoids", "EllipsoidsMesh")
+
+
 def _lit_gratings(scene: mi.Scene, sensor: mi.Sensor, max_depth: int, cache: SceneCache) -> Gratings | None:
     """Return the gratings from which light is traced; None if all paths are traced as in `path`.
 
@@ -164,6 +168,8 @@ def _lit_gratings(scene: mi.Scene, sensor: mi.Sensor, max_depth: int, cache: Sce
         ValueError: if the film takes samples outside its edge (`sample_border`).
     """
     if 0 <= max_depth < 2 or mi.is_polarized:
+        return None
+    if any(shape.class_name() in _MET_FROM_OUTSIDE for shape in scene.shapes()):
         return None
     # Points of the scene can be connected to `perspective` and `thinlens`.
     if not implements(sensor.sample_direction, dr.zeros(mi.SurfaceInteraction3f), mi.Point2f(0.5)):

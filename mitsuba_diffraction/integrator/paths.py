@@ -53,7 +53,7 @@ class Gratings:
     """The shapes whose BSDF is or holds a `diffraction_grating` and on which points can be drawn by area.
 
     A shape counts as a whole, whichever component of its BSDF reflects: both sides of `twosided`, all of a blend, and
-    the base. Shapes on which Mitsuba draws no points do not count, as instances, curves, `sdfgrid` and `ellipsoids`.
+    the base. Shapes on which Mitsuba draws no points do not count, as instances, curves and `sdfgrid`.
 
     Attributes:
         shapes: list of `mi.Shape`.

@@ -120,7 +120,7 @@ def test_the_opacity_of_a_mask_counts_once(llvm):
 
 @pytest.mark.parametrize("kind", ["ellipsoids", "ellipsoidsmesh"])
 def test_rays_meet_ellipsoids_from_outside_only(llvm, tmp_path, kind):
-    """In Mitsuba 3.9.1: docs/integrators.md advises against them, and random scenes have none."""
+    """In Mitsuba 3.9.1; `diffraction_path` is then `path`, and random scenes have none."""
     names = "x y z nx ny nz scale_0 scale_1 scale_2 rot_0 rot_1 rot_2 rot_3"
     header = ["ply", "format ascii 1.0", "element vertex 1", *(f"property float {name}" for name in names.split())]
     path = tmp_path / "one.ply"
@@ -128,3 +128,6 @@ def test_rays_meet_ellipsoids_from_outside_only(llvm, tmp_path, kind):
     built = mi.load_dict({"type": "scene", "shape": {"type": kind, "filename": str(path)}})
     found = {z: bool(built.ray_test(mi.Ray3f(mi.Point3f(0.01, 0.02, z), mi.Vector3f(0, 0, 1)))[0]) for z in (-20, 0)}
     assert found == {-20: True, 0: False}
+    lit = scene(shape={"type": kind, "filename": str(path)}, wall=plate(blaze(), 0.5), sun=SUN)
+    integrator = mi.load_dict({"type": "diffraction_path"})
+    assert integrator.parts(lit, lit.sensors()[0]) == (integrator.path, None)
