@@ -10,6 +10,7 @@ import mitsuba as mi
 # Class names of plugins.
 INSTANCE, SHAPE_GROUP = "Instance", "ShapeGroupPlugin"
 RECTANGLE, DISK, SPHERE = "Rectangle", "Disk", "Sphere"
+MET_FROM_OUTSIDE = "Ellipsoids", "EllipsoidsMesh"  # shapes of which rays miss the back
 TWO_SIDED, BLEND, NORMAL_MAP, BUMP_MAP = "TwoSidedBRDF", "BlendBSDF", "NormalMap", "BumpMap"
 DIFFUSE, ROUGH_CONDUCTOR = "SmoothDiffuse", "RoughConductor"
 DIRECTIONAL, POINT = "DirectionalEmitter", "PointLight"

@@ -8,7 +8,7 @@ import drjit as dr
 import mitsuba as mi
 
 from ..bsdf.light import is_black, recorded_wavelengths
-from ..bsdf.mitsuba_internals import camera_rays, nested_plugin
+from ..bsdf.mitsuba_internals import MET_FROM_OUTSIDE, camera_rays, nested_plugin
 from ..errors import RequestError
 from ..parameter_documentation import Parameter, listed
 from .eye_paths import EyeTracer, define_eye_paths
@@ -157,10 +157,6 @@ def define() -> type:
     return DiffractionPath
 
 
-# Paths from the light would have other obstacles there than those from the eye.
-_MET_FROM_OUTSIDE = ("Ellipsoids", "EllipsoidsMesh")
-
-
 def _lit_gratings(scene: mi.Scene, sensor: mi.Sensor, max_depth: int, cache: SceneCache) -> Gratings | None:
     """Return the gratings from which light is traced; None if all paths are traced as in `path`.
 
@@ -169,7 +165,8 @@ def _lit_gratings(scene: mi.Scene, sensor: mi.Sensor, max_depth: int, cache: Sce
     """
     if 0 <= max_depth < 2 or mi.is_polarized:
         return None
-    if any(shape.class_name() in _MET_FROM_OUTSIDE for shape in scene.shapes()):
+    # Paths from the light would have other obstacles than those from the eye.
+    if any(shape.class_name() in MET_FROM_OUTSIDE for shape in scene.shapes()):
         return None
     # Points of the scene can be connected to `perspective` and `thinlens`.
     if not implements(sensor.sample_direction, dr.zeros(mi.SurfaceInteraction3f), mi.Point2f(0.5)):
