@@ -143,6 +143,9 @@ class Fails:
     def sync(self, call, *_, **__):
         return call()
 
+    def run(self, call, *arguments, **__):
+        return {"a": call(*arguments)}
+
     def cancel(self, *_, **__):
         return None
 

@@ -514,7 +514,7 @@ def test_a_scene_searches_the_folders_that_it_names(llvm, tmp_path):
     assert {file.name for file in scene_file.files()} == {"scene.xml", "paint.xml", "grey.png"}
     before = scene_file.digest()
     Image.new("L", (2, 2), 129).save(folder / "common" / "maps" / "grey.png")
-    assert scene_file.moved(None).digest() != before
+    assert scene_file.viewed(motion=None).digest() != before
     grating = {"profile": "blazed", "period": 2.5, "depth": 0.25, "orientation": "maps/grey.png"}
     (shape,) = SceneFile(path, {"folder": "common"}, {"painted": grating}).load().shapes()
     assert mi.traverse(shape.bsdf())["orientation.data"].shape == (2, 2, 1)
