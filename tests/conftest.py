@@ -19,7 +19,6 @@ from threadpoolctl import threadpool_limits
 import mitsuba_diffraction as md  # before Dr.Jit, so that it has an LLVM that works
 from mitsuba_diffraction import cli, progress
 
-import drjit as dr  # isort: skip
 from bsdf_support import use  # isort: skip
 from mitsuba_diffraction.precomputation.grating_spectrum import GratingSpectrum
 from mitsuba_diffraction.render import passes
@@ -93,16 +92,6 @@ def one_thread_of_blas():
     with threadpool_limits(1, user_api="blas"), pytest.MonkeyPatch.context() as patch:
         patch.setenv("OPENBLAS_NUM_THREADS", "1")
         yield
-
-
-@pytest.fixture(scope="module", autouse=True)
-def one_thread_of_dr_jit(request):
-    """Compute with one thread in Dr.Jit, as well, where Mitsuba reads and writes no EXR picture, which then hangs."""
-    threads = dr.thread_count()
-    if request.path.parent.name in _OF_BSDFS:
-        dr.set_thread_count(1)
-    yield
-    dr.set_thread_count(threads)
 
 
 @pytest.fixture(scope="module", autouse=True)
