@@ -306,6 +306,9 @@ def test_one_function_makes_arrays_of_dr_jit_from_those_of_numpy():
     texts = {module: text for module, text in texts.items() if "import mitsuba as mi" in text}
     found = {f"{module}: {call}" for module, text in texts.items() for call in arrays_mapped_from_numpy(text)}
     assert found == {"mitsuba_diffraction.bsdf.device_tables: kind(memory)"}
+    # Of a list with one number, Mitsuba makes a literal: later passes, and other scenes, have kernels of their own.
+    for module, text in texts.items():
+        assert not re.search(r"DiscreteDistribution\((?!on_device\()", text), module
 
 
 def test_nothing_depends_on_what_judges_the_product():

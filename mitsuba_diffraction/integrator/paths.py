@@ -72,7 +72,8 @@ class Gratings:
         members = [shape for group in groups for shape in parts(group, mi.Shape) if has_instances]
         self.instanced = [shape for shape in members if gratings_in(shape.bsdf())]
         if self.shapes:
-            self._choice = mi.DiscreteDistribution([area for area in areas if area > 0])
+            # Of a list with one number Mitsuba makes a literal.
+            self._choice = mi.DiscreteDistribution(on_device([area for area in areas if area > 0]))
         kinds = [_kind_of(shape.bsdf()) for shape in self.shapes]
         self.has_mixture = _MIXTURE in kinds
         self.are_all = len(self.shapes) == len(shapes) and not self.instanced
