@@ -20,7 +20,6 @@ import mitsuba_diffraction as md  # before Dr.Jit, so that it has an LLVM that w
 from mitsuba_diffraction import cli, progress
 
 from bsdf_support import use  # isort: skip
-from mitsuba_diffraction.precomputation.grating_spectrum import GratingSpectrum
 from mitsuba_diffraction.render import passes
 
 # One example may be the first to import or to compile something.
@@ -34,9 +33,6 @@ _HEIGHT_RANGE = {"elaphe": 0.375, "xenopeltis": 0.819}
 """µm, black to white."""
 _TAKES_LONG = {"mi", "Furnace", "NotebookClient", "subprocess"}
 """What test modules import whose tests compile kernels, trace light in a furnace or start Python anew."""
-
-_OF_BSDFS = {"bsdf", "energy", "integrator"}
-"""Folders of tests."""
 
 
 def pytest_addoption(parser):
@@ -91,24 +87,6 @@ def one_thread_of_blas():
     """Compute with one thread in BLAS, here and in what tests start: waiting threads spin, on cores of other tests."""
     with threadpool_limits(1, user_api="blas"), pytest.MonkeyPatch.context() as patch:
         patch.setenv("OPENBLAS_NUM_THREADS", "1")
-        yield
-
-
-@pytest.fixture(scope="module", autouse=True)
-def spectra_are_not_cached(request, cache_folder):
-    """Leave spectra of profiles out of the cache where BSDFs are tested: its files have E, which few of them use.
-
-    E takes up to thirty times as long as S.
-    """
-    save = GratingSpectrum.save
-
-    def saved_elsewhere(spectrum, path, recipe=""):
-        if Path(path).parent != cache_folder:
-            save(spectrum, path, recipe)
-
-    with pytest.MonkeyPatch.context() as patch:
-        if request.path.parent.name in _OF_BSDFS:
-            patch.setattr(GratingSpectrum, "save", saved_elsewhere)
         yield
 
 

@@ -14,6 +14,7 @@ from __future__ import annotations
 import json
 import os
 import threading
+from contextlib import suppress
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from pathlib import Path
@@ -55,12 +56,14 @@ class GratingSpectrum(PowerSpectrum):
 
     Attributes:
         energy: the table of E, if read from the file; otherwise `energy_table` computes it.
+        cache: the file of the cache, and the digest of its recipe; `energy_table` adds E to it.
         waves: the waves of a recipe's surface, from which the error of scalar theory is estimated.
     """
 
     theory: ClassVar[str] = "scalar"
 
     energy: EnergyTable | None = field(default=None, repr=False)
+    cache: tuple[Path, str] | None = field(default=None, repr=False)
     waves: Waves | None = field(default=None, repr=False)
 
     @property
@@ -94,8 +97,15 @@ class GratingSpectrum(PowerSpectrum):
 
     @cached_property
     def _energy(self) -> EnergyTable:
+        if self.energy is not None:
+            return self.energy
         with stage("bound of the albedo"):
-            return EnergyTable.of(self) if self.energy is None else self.energy
+            table = EnergyTable.of(self)
+        if self.cache is not None:
+            # Without its E it is a spectrum of the cache as well, whose E is computed again.
+            with suppress(RequestError, OSError, RuntimeError):
+                replace(self, energy=table).save(*self.cache)
+        return table
 
     def up_to(self, longest: float) -> GratingSpectrum:
         """Return the spectrum for wavelengths up to `longest`, nm; the table, for κ from zero, holds for all of them.
@@ -105,15 +115,18 @@ class GratingSpectrum(PowerSpectrum):
         if longest <= self.wavelengths[1] * (1 + 1e-6):
             return self
         settings = replace(self.settings, wavelengths=(self.wavelengths[0], longest))
-        return replace(self, settings=settings, energy=None)
+        return replace(self, settings=settings, energy=None, cache=None)
 
     def save(self, path: str | os.PathLike[str], recipe: str = "") -> None:
         """Write the spectrum as an OpenEXR file, atomically; `recipe` is the digest of its `Recipe`.
+
+        Files have E, which takes up to thirty times as long as S; that of the cache, once a BSDF has used it.
 
         Raises:
             OSError: if the file cannot be written.
         """
         grid, table = self.grid, self.table
+        energy = self.energy if (path, recipe) == self.cache else self.energy_table()
         header: dict[str, Any] = {
             "representation": self.representation,
             "extent": self.extent,
@@ -129,7 +142,7 @@ class GratingSpectrum(PowerSpectrum):
             **({} if self.standard_error is None else {"standardError": doubles(self.standard_error)}),
             "units": "lengths in micrometres, wavelengths in nanometres",
             **({} if self.waves is None else {"waves": json.dumps(self.waves.as_plain())}),
-            "energy": json.dumps(self.energy_table().as_plain()),
+            **({} if energy is None else {"energy": json.dumps(energy.as_plain())}),
         }
         if isinstance(table, AmplitudeTable):
             header |= {"heightScale": doubles(table.height), "heightsFrom": self.settings.heights_from}
@@ -180,7 +193,8 @@ class GratingSpectrum(PowerSpectrum):
                 pixel_size=_pair(header["pixelSize"]),
                 **entries,
                 standard_error=_single(header["standardError"]) if settings.extent == "sample" else None,
-                energy=EnergyTable.from_plain(json.loads(header["energy"])),
+                energy=EnergyTable.from_plain(json.loads(header["energy"])) if "energy" in header else None,
+                cache=None if recipe is None or "energy" in header else (path, recipe),
                 waves=Waves.from_plain(json.loads(header["waves"])) if "waves" in header else None,
             )
             spectrum.check_powers()

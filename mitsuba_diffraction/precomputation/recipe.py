@@ -58,7 +58,7 @@ from ..surface.gratings import COHERENCE_LENGTHS, PATCHES, PROFILES, profile_nam
 from ..surface.heightfield import HeightField
 from ..surface.prepare import apply_steps, check_steps
 from ..surface.readers import read_height_field
-from .grating_spectrum import SCALAR_FORMAT_VERSION
+from .grating_spectrum import SCALAR_FORMAT_VERSION, GratingSpectrum
 from .spectra import Spectrum, build_spectrum, build_versions, is_rigorous, load_spectrum
 
 if sys.version_info >= (3, 11):
@@ -344,6 +344,8 @@ class Recipe:
             spectrum = self.build(report)
         # A scene keeps its recipes, but no longer needs their heights.
         self.__dict__.pop("_height_field", None)
+        if isinstance(spectrum, GratingSpectrum):
+            spectrum = replace(spectrum, cache=(path, digest))
         try:
             path.parent.mkdir(parents=True, exist_ok=True)
             spectrum.save(path, recipe=digest)

@@ -10,9 +10,10 @@ import pytest
 
 import mitsuba_diffraction as md
 from mitsuba_diffraction import GratingSpectrum, Recipe
+from mitsuba_diffraction.energy.table import EnergyTable
 from mitsuba_diffraction.precomputation import recipe as recipe_module
 from mitsuba_diffraction.precomputation.requested_surface import RequestedSurface
-from mitsuba_diffraction.precomputation.spectra import build_spectrum
+from mitsuba_diffraction.precomputation.spectra import build_spectrum, load_spectrum
 from mitsuba_diffraction.settings import RigorousSettings, ScalarSettings, Settings
 from mitsuba_diffraction.surface.readers import read_height_field
 
@@ -369,6 +370,28 @@ def test_a_spectrum_in_use_is_neither_built_nor_read_again(own_cache, builds):
     assert len(builds) == 1
 
 
+def test_e_is_computed_for_a_bsdf_and_added_to_the_cache(own_cache, monkeypatch):
+    computed, of = [], EnergyTable.of
+    monkeypatch.setattr(EnergyTable, "of", lambda spectrum: computed.append(spectrum) or of(spectrum))
+    recipe = Recipe(CROSSED, ScalarSettings(**FAST))
+    for spectrum in (recipe.cached(), load_spectrum(own_cache / f"{recipe.digest()}.exr", recipe.digest())):
+        assert not computed
+        assert spectrum.energy is None
+    table = spectrum.energy_table()
+    assert len(computed) == 1
+    found = load_spectrum(own_cache / f"{recipe.digest()}.exr", recipe.digest())
+    assert found.energy_table().as_plain() == table.as_plain()
+    assert found.digest == spectrum.digest
+    assert len(computed) == 1
+
+
+def test_e_is_computed_where_the_cache_has_gone(own_cache):
+    spectrum = Recipe(CROSSED, ScalarSettings(**FAST)).cached()
+    shutil.rmtree(own_cache)
+    assert spectrum.energy_table().values.min() > 0
+    assert not own_cache.exists()
+
+
 @pytest.mark.not_quick
 @pytest.mark.few(2)
 @pytest.mark.parametrize(
@@ -691,7 +714,8 @@ def test_a_command_reads_a_scan_once(tmp_path, command, monkeypatch, own_cache, 
     monkeypatch.chdir(tmp_path)
     np.save("scan.npy", np.tile(np.sin(np.arange(64) * np.pi / 4) * 0.1, (60, 1)))
     write(tmp_path, SAMPLE, "scan.toml")
-    grating = '<bsdf type="diffraction_grating"><string name="filename" value="scan.toml"/></bsdf>'
+    without_e = '<boolean name="conserve_energy" value="false"/>'
+    grating = f'<bsdf type="diffraction_grating"><string name="filename" value="scan.toml"/>{without_e}</bsdf>'
     shapes = 2 * f'<shape type="rectangle">{grating}</shape>'
     write(
         tmp_path,

@@ -248,7 +248,7 @@ def test_a_missing_entry_of_the_header_is_refused(saved):
     for name in (
         *("format", "formatVersion", "representation", "extent", "heightRange", "pixelSize", grid_entry(spectrum)),
         *("coherenceLength", "wavelengths", "tolerance", "error", "source", "sourceSha256"),
-        *("largestAngle", "dropped", "beyond", "channelCount", "energy"),
+        *("largestAngle", "dropped", "beyond", "channelCount"),
     ):
         path.write_bytes(content)
         rewrite(path, drop=[name])
