@@ -73,8 +73,17 @@ def pytest_collection_modifyitems(items):
             item.add_marker(pytest.mark.skip(reason=f"{posix.args[0]}: not on {sys.platform}"))
 
 
+@pytest.fixture(scope="session", autouse=True)
+def imported_modules_are_no_garbage():
+    """Leave what was imported out of later collections, each of which would take half a second."""
+    gc.collect()
+    gc.freeze()
+    yield
+    gc.unfreeze()
+
+
 @pytest.fixture(scope="module", autouse=True)
-def garbage_between_modules():
+def garbage_between_modules(imported_modules_are_no_garbage):
     """Collect garbage between modules only: Dr.Jit aborts where a scene is collected while `dr.freeze` records."""
     gc.collect()
     gc.disable()
