@@ -188,7 +188,7 @@ def test_a_value_given_for_the_default_of_denoise_is_taken(given, code, command,
     assert "denoise" in err
 
 
-def test_a_requested_denoiser_is_read_as_leniently_as_mitsuba_reads_scenes(tmp_path):
+def test_a_requested_denoiser_is_read_as_leniently_as_mitsuba_reads_scenes(tmp_path, llvm):
     path = tmp_path / "scene.xml"
     comment = '<!-- python x.py --small; <default name="denoise" value="false"/> -->'
     path.write_text(ASKS.replace("<integrator", comment + "<integrator"))
