@@ -207,8 +207,9 @@ def _trace_on_worker(job: Job, index: int) -> NDArray[np.float32]:
         raise Unsuitable(worker.address, f"a worker has {', '.join(versions())}; wanted {', '.join(job.versions)}")
     with pass_lock:
         mi.set_variant(job.variant)
-        if dr.thread_count() != worker.state.nthreads:
-            dr.set_thread_count(worker.state.nthreads)
+        # With one thread, Mitsuba 3.9.1 hangs when it reads an EXR picture.
+        if (threads := max(2, worker.state.nthreads)) != dr.thread_count():
+            dr.set_thread_count(threads)
         try:
             scene = scene_of(job)
         except RuntimeError as error:

@@ -13,6 +13,7 @@ import time
 from pathlib import Path
 
 import drjit as dr
+import mitsuba as mi
 import numpy as np
 import pytest
 
@@ -25,10 +26,11 @@ from mitsuba_diffraction.render.scene_file import SceneFile
 distributed = pytest.importorskip("distributed")
 
 SIZE = 16
+CONSTANT = '<emitter type="constant"/>'
 SCENE = f"""<scene version="3.0.0"><integrator type="path"/>
 <sensor type="perspective"><transform name="to_world"><lookat origin="0,-4,2" target="0,0,0.5" up="0,0,1"/></transform>
 <film type="hdrfilm"><integer name="width" value="{SIZE}"/><integer name="height" value="{SIZE}"/>
-<rfilter type="gaussian"/></film></sensor><emitter type="constant"/>
+<rfilter type="gaussian"/></film></sensor>{CONSTANT}
 <shape type="sphere"><point name="center" x="0.4" y="0" z="0.5"/><bsdf type="diffraction_grating">
 <string name="profile" value="blazed"/><float name="period" value="2.5"/><float name="depth" value="0.25"/>
 </bsdf></shape></scene>"""
@@ -74,11 +76,15 @@ def with_light_from_gratings(scene):
 
 
 def with_a_folder(scene):
-    """The same, whose sphere is in a file of a folder that the scene names."""
+    """The same, whose sphere and sky are in files of a folder that the scene names."""
     start, end = scene.index("<shape"), scene.index("</shape>") + len("</shape>")
     Path("parts").mkdir()
+    # Mitsuba hangs when it reads an EXR picture with one thread, as each of these workers has.
+    mi.Bitmap(np.linspace(0.5, 2, 8 * 16 * 3, dtype=np.float32).reshape(8, 16, 3)).write("parts/sky.exr")
+    sky = '<emitter type="envmap"><string name="filename" value="sky.exr"/></emitter>'
     Path("parts/sphere.xml").write_text(f'<scene version="3.0.0">{scene[start:end]}</scene>')
-    return f'{scene[:start]}<path value="parts"/><include filename="sphere.xml"/>{scene[end:]}'
+    scene = f'{scene[:start]}<path value="parts"/><include filename="sphere.xml"/>{scene[end:]}'
+    return scene.replace('<path value="parts"/>', "").replace(CONSTANT, f'<path value="parts"/>{sky}')
 
 
 @pytest.mark.slow
