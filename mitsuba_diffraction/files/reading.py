@@ -48,6 +48,8 @@ BAD_PICTURE = (
 MAX_ELEMENTS = 2**20  # of an XML file
 MAX_NESTING = 32  # of nested elements
 MAX_TIFF_PAGES, MAX_TIFF_TAGS = 256, 2**13
+_TIFF_SHAPE = 256, 257, 277  # tags of columns, rows and samples per pixel
+_TIFF_INTEGERS = {3: "H", 4: "I", 16: "Q"}  # type of a tag → struct's
 
 
 def check_file(path: str | os.PathLike[str], max_bytes: float = MAX_FILE_BYTES) -> None:
@@ -135,12 +137,13 @@ def check_unpacked(count: int, stored: int) -> None:
 
 
 def check_tiff(content: bytes) -> None:
-    """Check the chain of pages of a TIFF, which may lead into its data.
+    """Check the chain of pages of a TIFF, which may lead into its data, and the sizes of their pictures.
 
     What is no TIFF, or ends within a page, is left to whatever reads it.
 
     Raises:
-        RequestError: if it has more than `MAX_TIFF_PAGES` pages or `MAX_TIFF_TAGS` tags in all.
+        RequestError: if it has more than `MAX_TIFF_PAGES` pages or `MAX_TIFF_TAGS` tags in all, or a picture that
+            `check_array` refuses.
     """
     order = {b"II": "<", b"MM": ">"}.get(content[:2])
     if order is None or len(content) < 16:
@@ -158,7 +161,18 @@ def check_tiff(content: bytes) -> None:
             raise RequestError(f"got a TIFF of more than {MAX_TIFF_PAGES} pages or {MAX_TIFF_TAGS} tags, wanted fewer")
         if end > len(content) - offset.size:
             return
+        check_array(_picture_shape(content, at + number.size, count, order, is_big), len(content), item_bytes=2)
         (at,) = offset.unpack_from(content, end)
+
+
+def _picture_shape(content: bytes, start: int, count: int, order: str, is_big: bool) -> tuple[int, ...]:
+    """Return columns, rows and samples of the picture of a page of a TIFF, of the tags that it has."""
+    shape = dict.fromkeys(_TIFF_SHAPE, 1)
+    for at in range(start, start + count * (20 if is_big else 12), 20 if is_big else 12):
+        tag, kind = struct.unpack_from(f"{order}2H", content, at)
+        if tag in shape and kind in _TIFF_INTEGERS:
+            (shape[tag],) = struct.unpack_from(order + _TIFF_INTEGERS[kind], content, at + (12 if is_big else 8))
+    return tuple(shape.values())
 
 
 class _Bounded(ElementTree.TreeBuilder):

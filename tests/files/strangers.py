@@ -1,7 +1,8 @@
 """Files from strangers, and mutants of good ones: each is read, or refused in one line, within 10 s and 1 GB of memory.
 
 As a program, in a process of its own: `python strangers.py NAME…` of crafted files, `python strangers.py FORMAT:COUNT…`
-for so many mutants. It prints a line for each fault.
+for so many mutants, `python strangers.py SCAN:COUNT…` for those of an instrument's own file. It prints a line for each
+fault.
 """
 
 import functools
@@ -226,6 +227,12 @@ FORMATS = {
     "vk6": (".vk6", lambda: foreign_scans.vk4(wrapped=True), _INSTRUMENT),
     "zon": (".zon", foreign_scans.zon, _INSTRUMENT),
     "zon_compressed": (".zon", lambda: foreign_scans.zon(compressed=True), _INSTRUMENT),
+    "os3d": (".os3d", foreign_scans.os3d, _INSTRUMENT),
+    "zmg": (".zmg", foreign_scans.zmg, _INSTRUMENT),
+    "plux": (".plux", foreign_scans.plux, _INSTRUMENT),
+    "lext": (".lext", foreign_scans.lext, _INSTRUMENT),
+    "oir": (".oir", foreign_scans.oir, _INSTRUMENT),
+    "poir": (".poir", lambda: foreign_scans.oir(packed=True), _INSTRUMENT),
     "sxm": (".sxm", foreign_scans.sxm, _INSTRUMENT),
     "h5_jpk": (".h5-jpk", foreign_scans.h5_jpk, _INSTRUMENT),
     "recipe": (".toml", lambda: _PROFILE, lambda path: Recipe.load(path).check()),
@@ -285,9 +292,10 @@ def mutant(content, random_):
 def _changed(content, random_):
     data = bytearray(content)
     for _ in range(random_.choice((1, 1, 1, 2, 4))):
-        at = random_.randrange(len(data) + 1)
+        # A header is a small part of a large file.
+        at = random_.randrange(min(len(data), random_.choice((len(data), 4096))) + 1)
         kind = random_.choice(("bits", "length", "text", "text", "binary"))
-        numbers = list(_NUMBER.finditer(data)) if kind == "text" else []
+        numbers = list(_NUMBER.finditer(data, 0, 10**5)) if kind == "text" else []
         if kind == "bits" and at < len(data):
             data[at] ^= 1 << random_.randrange(8)
         elif kind == "length":
@@ -632,10 +640,15 @@ def write(path, content):
             seal(path)
 
 
+def format_named(name):
+    """The suffix of a format, or of an instrument's own file, how it is made, and how it is read."""
+    return FORMATS[name] if name in FORMATS else (Path(name).suffix, Path(name).read_bytes, _INSTRUMENT)
+
+
 def faults_of_mutants(name, count, folder, seed=0):
     """Yield the number and the fault of those among `count` mutants that have one."""
-    suffix, make, read = FORMATS[name]
-    original, path = make(), folder / f"{name}{suffix}"
+    suffix, make, read = format_named(name)
+    original, path = make(), folder / f"original{suffix}"
     np.save(folder / "scan.npy", RELIEF)
     write(path, original)
     read(path)
@@ -676,17 +689,17 @@ def _in_this_process(names):
             if name in crafted:
                 suffix, make, _ = crafted[name]
                 write(folder / f"{name}{suffix}", make())
-        for name in {name.partition(":")[0] for name in names} & FORMATS.keys():
-            suffix, make, read = FORMATS[name]
+        for name in {name.rpartition(":")[0] for name in names} - {""}:
+            suffix, make, read = format_named(name)
             path = folder / f"original{suffix}"
             write(path, make())
             np.save(folder / "scan.npy", RELIEF)
             read(path)  # what it imports is not counted
         _limit_memory()
         for name in names:
-            kind, _, count = name.partition(":")
+            kind, _, count = name.rpartition(":")
             print(f"{name} …", file=sys.stderr, flush=True)
-            if kind in FORMATS:
+            if kind:
                 for number, found in faults_of_mutants(kind, int(count), folder):
                     print(f"{kind} {number}: {found}", flush=True)
             else:

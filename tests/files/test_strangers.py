@@ -12,6 +12,7 @@ MUTANTS = 2000
 _OF_THE_EXTRA = (
     *("x3p", "x3p_text", "sur", "tmd", "nms", "ibw", "jpk", "jpk_archive", "park", "nanoscope", "nanoscope_text"),
     *("mdt", "datx", "opd", "vk4", "vk6", "zon", "zon_compressed", "h5_jpk"),
+    *("os3d", "zmg", "plux", "lext", "oir", "poir"),
 )
 _SLOW_TO_MAKE = ("spectrum_rigorous", "spectrum_of_sample")
 

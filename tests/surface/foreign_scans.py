@@ -429,6 +429,104 @@ def jpk(lines=ROWS, image="", curves=0, retrace=False):
     return archive.getvalue()
 
 
+def os3d():
+    """OmniSurf3D: texts with their lengths, sizes, and heights of float32, downwards, all in µm."""
+    texts = b"".join(struct.pack("<I", len(text)) + text for text in (b"a relief", b"2026-11-29T12:00:00"))
+    sizes = struct.pack("<2i4d", COLUMNS, ROWS, DX, DY, 0.0, 0.0)
+    return b"OmniSurf3D" + struct.pack("<2i", 1, 0) + texts + sizes + relief().astype("<f4").tobytes()
+
+
+def zmg():
+    """Zeta: header of 201 bytes, a comment, and uint16, downwards; steps in µm."""
+    step, comment = 1e-4, b"a relief"
+    sizes = struct.pack("<2I4s3f8sI", COLUMNS, ROWS, b"", DX, DY, step, b"", len(comment))
+    head = b"Zeta-Instruments" + bytes(69) + sizes + bytes(10 + 68 + 6)
+    return head + comment + np.rint(relief() / step).astype("<u2").tobytes()
+
+
+def plux():
+    """Sensofar: an archive of an index in XML, and a layer of float32, downwards, in µm."""
+    index = f"""<xml><GENERAL><IMAGE_SIZE_X>{COLUMNS}</IMAGE_SIZE_X><IMAGE_SIZE_Y>{ROWS}</IMAGE_SIZE_Y>
+<FOV_X>{DX}</FOV_X><FOV_Y>{DY}</FOV_Y><DATE>2026-11-29</DATE></GENERAL>
+<INFO><ITEM_0><NAME>Device</NAME><VALUE>S neox</VALUE></ITEM_0>
+</INFO><LAYER_0><FILENAME_Z>LAYER_0.raw</FILENAME_Z></LAYER_0></xml>"""
+    whole = io.BytesIO()
+    with zipfile.ZipFile(whole, "w") as archive:
+        archive.writestr("index.xml", index)
+        archive.writestr("LAYER_0.raw", relief().astype("<f4").tobytes())
+    return whole.getvalue()
+
+
+def lext():
+    """Olympus LEXT: a TIFF with an overview, whose texts have the scale, and a page of heights, uint16, downwards."""
+    import tifffile
+
+    step = 100  # pm
+    scale = f"""<TiffTagDescData><HeightInfo><HeightDataPerPixelX>{DX * 1e6}</HeightDataPerPixelX>
+<HeightDataPerPixelY>{DY * 1e6}</HeightDataPerPixelY><HeightDataPerPixelZ>{step}</HeightDataPerPixelZ>
+<HeightDataUnitX>1</HeightDataUnitX><HeightDataUnitY>1</HeightDataUnitY><HeightDataUnitZ>1</HeightDataUnitZ>
+</HeightInfo></TiffTagDescData>"""
+    calibration = "".join(f"<MakerCalibrationValue{axis}>1000000</MakerCalibrationValue{axis}>" for axis in "XYZ")
+    common = f"<ImageCommonSettingsInfo>{calibration}</ImageCommonSettingsInfo>"
+    settings = f"<ExifTagDescData>{common}</ExifTagDescData>\0".encode()
+    whole = io.BytesIO()
+    with tifffile.TiffWriter(whole) as file:
+        page = {"metadata": None, "photometric": "minisblack"}
+        tags = [(65000, "I", 1, 0, True)]
+        file.write(np.zeros((ROWS, COLUMNS), "u1"), description=scale, extratags=tags, **page)
+        file.write(np.rint(relief() * 1e6 / step).astype("<u2"), description="HEIGHT", **page)
+    # The place of a directory of one entry, which follows.
+    content = whole.getvalue()
+    placeholder, tag = (struct.pack("<2H2I", number, 4, 1, at) for number, at in ((65000, 0), (34665, len(content))))
+    content = content.replace(placeholder, tag)
+    return content + struct.pack("<3H3I", 1, 41995, 2, len(settings), len(content) + 18, 0) + settings
+
+
+def oir(packed=False):
+    """Olympus OIR: chunks of properties in XML, of names, and of uint16, downwards; `packed` as POIR, zipped."""
+    step, words = 1e-4, "commonphase:imageDefinition"  # µm
+
+    def text(word):
+        return struct.pack("<I", len(word)) + word.encode()
+
+    def block(kind, content):
+        return struct.pack("<I8I", kind, 1, 1, 0, 0, 1, 1, 1, 1) + content
+
+    def xyz(name, values, kind):
+        inner = "".join(f"<{kind}:{axis}>{value}</{kind}:{axis}>" for axis, value in zip("xyz", values, strict=True))
+        return f"<commonphase:{name}>{inner}</commonphase:{name}>"
+
+    channels = "".join(
+        f"""<commonphase:channel id="{name}"><{words}><commonphase:imageType>{kind}</commonphase:imageType>
+<commonphase:depth>2</commonphase:depth></{words}>{xyz("length", (DX, DY, step), "commonparam")}
+{xyz("pixelUnit", 3 * ("um",), "commonphase")}</commonphase:channel>"""
+        for name, kind in (("a1", "HEIGHT"), ("a2", "INTENSITY"))
+    )
+    properties = f"""<lsmimage:imageProperties><commonimage:general>
+<base:creationDateTime>2026-11-29</base:creationDateTime></commonimage:general><commonimage:microscope><base:name>OLS</base:name></commonimage:microscope><commonimage:imageInfo>
+<commonimage:width>{COLUMNS}</commonimage:width><commonimage:height>{ROWS}</commonimage:height><commonimage:phase>
+<commonphase:group>{channels}</commonphase:group></commonimage:phase></commonimage:imageInfo><commonimage:acquisition>
+<commonimage:microscopeConfiguration><commonimage:pixelCalibration><commonparam:x>1</commonparam:x>
+</commonimage:pixelCalibration></commonimage:microscopeConfiguration></commonimage:acquisition>
+</lsmimage:imageProperties>"""
+    prefix, names = text("t001_0_1") + bytes(4), text("a1") + bytes(4) + text("a2") + bytes(4)
+    blocks = block(2, text(properties)) + block(6, struct.pack("<I", 1) + prefix)
+    blocks += block(8, struct.pack("<I", 2) + names)
+    heights = np.rint(relief() / step).astype("<u2").tobytes()
+    named = struct.pack("<2I", 0, len(heights)) + text("t001_0_1_a1_0")
+    chunks = struct.pack("<2i", len(blocks), 0) + blocks
+    chunks += struct.pack("<2i", len(named), 3) + named + struct.pack("<2I", len(heights), 4) + heights
+    numbers = (12, 0, 1, 2, 100, 2, 0, 0, 17, 0, 1, 0, 0, 0)
+    head = b"OLYMPUSRAWFORMAT" + struct.pack("<14I8s4I", *numbers, b"UNKNOWN", 1, 1, 2**32 - 1, 2**32 - 1)
+    whole = head + chunks + struct.pack("<i", -1)
+    if not packed:
+        return whole
+    archive = io.BytesIO()
+    with zipfile.ZipFile(archive, "w", zipfile.ZIP_DEFLATED) as written:
+        written.writestr("a scan.oir", whole)
+    return archive.getvalue()
+
+
 def nanoscope(heights, settings=(), image=(), sizes=None):
     """Nanoscope: a header of text, padded, then the lines of each image, upwards.
 

@@ -22,7 +22,7 @@ from .scan import EXTRA, Channel, Scan, choose_channel
 
 # Formats that SurfaceTopography names by their extension, and others.
 _NAMED_ALIKE = (
-    "al3d bcr datx ezd frt ibw jpk lext mdt mi mnt nms oir opd opdx os3d plu plux poir qep sdf sur tmd x3p zmg zon"
+    "al3d bcr datx ezd frt ibw jpk lext mdt mi mnt nms oir opd opdx os3d plu plux poir sdf sur tmd x3p zmg zon"
 )
 _NAMED_OTHERWISE = (
     {".bcrf": "bcr", ".dat": "metropro", ".nid": "ezd", ".spm": "di"}

@@ -55,12 +55,12 @@ class Rewritten(NamedTuple):
     """A file for the library.
 
     Attributes:
-        contents: the path, or the bytes.
+        contents: the bytes; of a path the library would read as many as a file declares, and it does not have.
         doubts: `Scan.doubt` by channel.
         has_unit_of_heights: if not, the library takes the unit of the surface.
     """
 
-    contents: str | io.BytesIO
+    contents: io.BytesIO
     doubts: Sequence[str] = ()
     has_unit_of_heights: bool = True
 
@@ -78,7 +78,7 @@ def rewritten(path: Path, name: str) -> Rewritten:
     if name in _TIFF:
         check_tiff(read_bytes(path))
     if name not in (*_REWRITE, "di"):
-        return Rewritten(_archive(path) if zipfile.is_zipfile(path) else str(path))
+        return Rewritten(_archive(path) if zipfile.is_zipfile(path) else io.BytesIO(read_bytes(path)))
     data = read_bytes(path)
     if name == "di":
         data, doubts = nanoscope.rewritten_nanoscope(data)
