@@ -28,6 +28,8 @@ settings.register_profile("tests", deadline=None, max_examples=30, derandomize="
 settings.register_profile("slow", deadline=None, max_examples=200)
 settings.register_profile("quick", deadline=None, max_examples=5)
 
+gc.disable()  # while tests are collected, which makes no garbage
+
 MEASURED = Path(__file__).parents[1] / "precompute" / "measured"
 _HEIGHT_RANGE = {"elaphe": 0.375, "xenopeltis": 0.819}
 """µm, black to white."""
@@ -78,6 +80,7 @@ def imported_modules_are_no_garbage():
     """Leave what was imported out of later collections, each of which would take half a second."""
     gc.collect()
     gc.freeze()
+    gc.enable()
     yield
     gc.unfreeze()
 

@@ -156,9 +156,9 @@ def test_a_profile_is_scaled_up_as_well_as_down(llvm):
         parameters["lateral_scale"] = scale
         parameters.update()
         spectra.append(bsdf.spectrum)
-        wo = near_orders(scale, LINE)
-        wanted = evaluate(mi.load_dict({**profile, "period": PERIOD * scale}), WI, wo)[0]
-        np.testing.assert_allclose(evaluate(bsdf, WI, wo)[0], wanted, rtol=2e-3, atol=1e-3 * wanted.max())
+    wo = near_orders(scale, LINE)
+    wanted = evaluate(mi.load_dict({**profile, "period": PERIOD * scale}), WI, wo)[0]
+    np.testing.assert_allclose(evaluate(bsdf, WI, wo)[0], wanted, rtol=2e-3, atol=1e-3 * wanted.max())
     assert spectra[1] is not spectra[0]
     assert spectra[1] is spectra[2]
     assert bsdf.layers.grating.lacks((380.0, 780.0)) == []

@@ -203,7 +203,7 @@ def test_the_plugin_reflects_as_a_plane_at_the_half_vector(llvm, mode):
             assert found[channel, n] / bare[channel, n] == pytest.approx(with_film / without, rel=1e-3)
 
 
-@pytest.mark.few(1)
+@pytest.mark.slow
 @pytest.mark.parametrize("side", [1, -1])
 @pytest.mark.parametrize(("mode", "least"), [("interface", 0.99), ("sheet", 0.95)])
 def test_a_relief_with_a_clear_film_reflects_and_transmits_all_light(llvm, mode, least, side):

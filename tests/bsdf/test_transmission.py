@@ -121,7 +121,7 @@ def test_orders_have_the_powers_of_the_closed_form(kind, profile, depth, theta, 
         assert np.abs(np.subtract(found, wanted)).sum() < 0.005 * max(1, np.sum(wanted))
 
 
-@pytest.mark.few(1)
+@pytest.mark.slow
 @pytest.mark.parametrize("kind", KINDS)
 @pytest.mark.parametrize("profile", ["sinusoidal", "blazed"])
 def test_transmission_is_reciprocal(kind, profile):

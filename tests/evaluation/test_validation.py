@@ -168,6 +168,7 @@ def test_the_map_of_transmitted_light_agrees_with_the_solver(way, period, depth,
     )
 
 
+@pytest.mark.few(1)
 @pytest.mark.parametrize(
     ("lines", "blaze", "glass", "aluminium"), [(600, 500, 0.103, 0.192), (1200, 500, 0.286, 0.464)]
 )
@@ -212,7 +213,7 @@ def test_a_surface_outside_the_range_of_scalar_theory_is_reported():
             assert scalar_theory.scalar_error(flat, extent).reflected == 0
 
 
-@pytest.mark.few(2)
+@pytest.mark.few(1)
 @pytest.mark.parametrize("name", ["sinusoidal", "blazed"])
 @pytest.mark.parametrize("period", [3.25, 3.7, 8.0])
 def test_no_surface_within_the_promised_range_is_warned_of(name, period):
@@ -262,7 +263,7 @@ def test_equal_profiles_are_solved_once(monkeypatch):
     assert len(solved) == 9
 
 
-@pytest.mark.few(2)
+@pytest.mark.few(1)
 @pytest.mark.parametrize("scale", [0.5, 20.0])
 @pytest.mark.parametrize("surface", [md.gratings.crossed(1.6, 0.3, samples=32), md.gratings.blazed(2.5, 0.25)])
 def test_the_error_depends_on_lengths_in_wavelengths(surface, scale):

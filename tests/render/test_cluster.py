@@ -10,6 +10,7 @@ import subprocess
 import sys
 import threading
 import time
+from importlib.util import find_spec
 from pathlib import Path
 
 import drjit as dr
@@ -23,7 +24,7 @@ from mitsuba_diffraction.render.cluster import trace_on
 from mitsuba_diffraction.render.passes import Interrupted
 from mitsuba_diffraction.render.scene_file import SceneFile
 
-distributed = pytest.importorskip("distributed")
+pytestmark = pytest.mark.skipif(not find_spec("distributed"), reason="Dask is not installed")
 
 SIZE = 16
 CONSTANT = '<emitter type="constant"/>'
@@ -49,7 +50,15 @@ def folder(tmp_path, monkeypatch, small_passes):
 
 
 def start(**options):
+    import distributed  # takes a second
+
     return distributed.LocalCluster(dashboard_address=":0", threads_per_worker=1, **options)
+
+
+def client_of(address):
+    import distributed
+
+    return distributed.Client(address, set_as_default=False)
 
 
 @pytest.fixture
@@ -215,7 +224,7 @@ def invented_passes(monkeypatch):
 
 
 def workers_of(address):
-    with distributed.Client(address, set_as_default=False) as client:
+    with client_of(address) as client:
         return set(client.nthreads())
 
 
@@ -263,11 +272,13 @@ def test_ctrl_c_is_heard_without_workers(invented_passes, monkeypatch):
 
 
 def test_a_late_worker_of_another_version_is_left_out(invented_passes, monkeypatch, caplog):
+    from distributed import get_worker
+
     with start(n_workers=1, processes=False, protocol="tcp") as local:
         first, known = workers_of(local.scheduler_address), cluster.versions()
 
         def versions():
-            return known if distributed.get_worker().address in first else ("mitsuba 2.0",)
+            return known if get_worker().address in first else ("mitsuba 2.0",)
 
         monkeypatch.setattr(cluster, "versions", versions)
 
@@ -302,7 +313,7 @@ def test_a_worker_without_the_package_is_left_out(late, invented_passes, caplog)
                 worker = subprocess.Popen(call, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
                 ends.callback(worker.wait)
                 ends.callback(worker.kill)
-                with distributed.Client(local.scheduler_address, set_as_default=False) as client:
+                with client_of(local.scheduler_address) as client:
                     client.wait_for_workers(len(first) + 1, timeout=120)
 
         if late:
@@ -367,7 +378,7 @@ def test_a_killed_scheduler_is_one_line():
 @pytest.mark.parametrize("processes", [2], indirect=True)
 def test_the_passes_of_a_lost_worker_are_traced_again(processes):
     here = render("scene.xml", spp=60)
-    with distributed.Client(processes.scheduler_address, set_as_default=False) as client:
+    with client_of(processes.scheduler_address) as client:
         pids = list(client.run(os.getpid).values())
     assert len(set(pids)) == 2
     calls = []

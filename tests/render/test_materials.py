@@ -371,7 +371,8 @@ def test_the_command_replaces_several_materials(exported, command, monkeypatch, 
     monkeypatch.chdir(tmp_path)
     exported()
     Path("wall.toml").write_text('[surface]\nprofile = "sinusoidal"\nperiod = 2.0\ndepth = 0.1\n')
-    words = ("--material", "mat-Floor=wall.toml,int_ior=1.4", "--material", "mat-Disc=blazed,depth=0.2,material=Al")
+    words = ("--material", "mat-Floor=wall.toml,int_ior=1.4,conserve_energy=false", "--material")
+    words += ("mat-Disc=blazed,depth=0.2,material=Al,conserve_energy=false",)
     code, _, error = command("render", "exported.xml", *words, "--spp", "1", "--width", "8")
     assert code == 0, error
     code, _, error = command("render", "exported.xml", "--material", "Disc=blazed", "--overwrite")

@@ -102,7 +102,7 @@ CASES = {
 }
 
 
-@pytest.mark.few(3)
+@pytest.mark.few(1)
 @pytest.mark.parametrize("name", CASES)
 def test_case(llvm, tmp_path, name):
     judge(CASES[name], tmp_path, ("value", "density", "tables", "derivatives"))
