@@ -213,7 +213,7 @@ def test_a_surface_outside_the_range_of_scalar_theory_is_reported():
             assert scalar_theory.scalar_error(flat, extent).reflected == 0
 
 
-@pytest.mark.few(1)
+@pytest.mark.few(2)
 @pytest.mark.parametrize("name", ["sinusoidal", "blazed"])
 @pytest.mark.parametrize("period", [3.25, 3.7, 8.0])
 def test_no_surface_within_the_promised_range_is_warned_of(name, period):
