@@ -24,7 +24,7 @@ from ..optics.media import MediumBelow
 from .colour_table import ColourTable, OrderColours, Viewed, colours_of
 
 _MAGIC = b"MDCF"
-_VERSION = 2
+_VERSION = 3
 
 
 def check_base(base: str | None, below: MediumBelow) -> None:

@@ -11,8 +11,13 @@ Gaussian in ν = 1/λ,
 
     |u ν − q_m|² = |u|² (ν − c)² + d²,    c = u·q_m/|u|²,    d² = |q_m|² − c² |u|²,    s = σ_q/|u|,
 
-so that its colour is that of a Gaussian of light about c, of width s, in a table over c and s (`OrderColours`). Around
-the mirror direction, order 0 has all wavelengths at once: a table over |u|/σ_q and w.
+so that its colour is that of a Gaussian of light about c, of width s, in a table over c and s (`OrderColours`), times
+g = η_m R at c. In a wide lobe g varies. There it is interpolated between nodes ν_j with spacing d by Gaussians of width
+p = d/1.7, which have a constant sum, and whose products with the lobe are Gaussians once more:
+
+    g(ν) ≈ Σ_j (g_j − (p/d)² (g_{j−1} − 2g_j + g_{j+1})/2) e^{−(ν − ν_j)²/2p²} d/√(2π)p
+
+exact to the third power of ν.
 """
 
 from __future__ import annotations
@@ -40,12 +45,17 @@ _FINER = 2  # steps of w between two nodes, to which they are fitted
 _MIN_W = 0.15  # without a coat: both directions at 86° from the normal
 _MAX_U = 2.0
 MAX_MEAN_ERROR, MAX_95_ERROR, MAX_FLUX_ERROR = 0.5, 1.5, 0.03  # ΔE00, and of the sum
-_PAIRS = 4000  # of directions, between which and the integral the error is measured
+PAIRS = 4000  # of directions, between which and the integral the error is measured
 _ANGLES, _MAX_VIEW = (0.0, 20.0, 40.0, 60.0), 80.0  # of these pairs, degrees
 _MIN_POWER = 1e-4  # of an order at any κ
 MAX_ORDERS = 256
-_KAPPAS, _CENTRES, _WIDTHS, _COSINES = 65, 512, 24, 16
-_MAX_CENTRE, _WIDTH_RANGE = 4.0, (3e-3, 30.0)  # 1/µm
+_KAPPAS, _CENTRES, _WIDTHS, _COSINES = 65, 512, 12, 16
+_LOW, _HIGH = 1e3 / _LONGEST, 1e3 / _SHORTEST  # ν, 1/µm
+_NODES, _PER_SPACING = 8, 1 / 1.7  # ν_j, the first and the last next to visible light; p/d
+_SPACING = (_HIGH - _LOW) / (_NODES - 2)
+_MAX_SINGLE = 0.06  # s of a lobe in which g is taken at c, 1/µm
+_CUTOFF = 4.0  # of lobes, and of their products with Gaussians of nodes, in standard deviations
+_MAX_CENTRE, _WIDTH_RANGE = 4.0, (3e-3, _SPACING * _PER_SPACING)  # 1/µm
 
 
 @dataclass(frozen=True, eq=False)
@@ -102,18 +112,18 @@ class Viewed:
         Views are uniform over the hemisphere, or in the lobes of separate orders, drawn by their power.
         """
         rng = np.random.default_rng(0)
-        theta, phi = np.deg2rad(rng.choice(_ANGLES, _PAIRS)), rng.uniform(0, 2 * np.pi, (2, _PAIRS))
+        theta, phi = np.deg2rad(rng.choice(_ANGLES, PAIRS)), rng.uniform(0, 2 * np.pi, (2, PAIRS))
         largest = np.sin(np.deg2rad(_MAX_VIEW))
         incident = np.sin(theta)[:, None] * np.stack([np.cos(phi[0]), np.sin(phi[0])], -1)
         if self.has_separate_orders:
-            wavelength = rng.uniform(_SHORTEST, _LONGEST, _PAIRS) * 1e-3
+            wavelength = rng.uniform(_SHORTEST, _LONGEST, PAIRS) * 1e-3
             q = np.stack(np.meshgrid(*self.spectrum.grid.frequencies()), -1).reshape(-1, 2)
             power = np.maximum(self.powers(2 * np.pi * self.range_w[1] / 0.55), 0).ravel()
-            drawn = rng.choice(len(q), _PAIRS, p=power / power.sum())
-            offset = self.spectrum.lobe_width * rng.standard_normal((_PAIRS, 2))
+            drawn = rng.choice(len(q), PAIRS, p=power / power.sum())
+            offset = self.spectrum.lobe_width * rng.standard_normal((PAIRS, 2))
             outgoing = -incident - wavelength[:, None] * (q[drawn] + offset)
         else:
-            sine = np.sqrt(1 - rng.uniform(np.sqrt(1 - largest**2), 1, _PAIRS) ** 2)
+            sine = np.sqrt(1 - rng.uniform(np.sqrt(1 - largest**2), 1, PAIRS) ** 2)
             outgoing = sine[:, None] * np.stack([np.cos(phi[1]), np.sin(phi[1])], -1)
         seen = np.linalg.norm(outgoing, axis=-1) <= largest
         tangents = np.stack([incident[seen], outgoing[seen]])
@@ -193,11 +203,9 @@ class OrderColours:
         powers: η_m at equal steps of κ from 0 to `max_kappa`, (n, k).
         max_kappa: rad/µm, at the height scale of the table.
         lobe_width: σ_q, cycles/µm.
-        light: ∫ R_0 (x̄, ȳ, z̄) E e^{−(ν − c)²/2s²} dν/min(s, 1 µm⁻¹), R_0 the reflectance at cos θ_h = 1, over s in
-            equal steps of its logarithm and over c from 0, (s, c, 3).
+        light: ∫ R_0 (x̄, ȳ, z̄) E e^{−(ν − c)²/2s²} dν/s, R_0 the reflectance at cos θ_h = 1, over s in equal steps of
+            its logarithm and over c from 0, (s, c, 3).
         reflectance: R/R_0 over ν of visible light and cos θ_h from 0 to 1, (cosines, ν).
-        mirror: C of order 0 over w and over |u|/σ_q from 0 to `max_mirror`, (w, |u|/σ_q, 3).
-        range_w: the first and the last w of `mirror`.
         error: beside the integral.
     """
 
@@ -208,36 +216,54 @@ class OrderColours:
     lobe_width: float
     light: Real
     reflectance: Real
-    mirror: Real
-    range_w: tuple[float, float]
     coat: float
     error: ColourError = ColourError()
 
-    max_mirror = 6.0 * _LONGEST * 1e-3
-
     def colour(self, u: Real, w: Real) -> Real:
         """Return C, (n, 3), of u (n, 2) and w (n,)."""
-        first, last = self.range_w
+        total = np.zeros((len(w), 3))
         length = np.maximum(np.linalg.norm(u, axis=-1), 1e-6)
-        x = length / (self.lobe_width * self.max_mirror)
-        total = _interpolated(self.mirror, (w - first) / (last - first), x) * (x <= 1)[:, None]
         s = self.lobe_width / length
-        row = np.log(s / _WIDTH_RANGE[0]) / np.log(_WIDTH_RANGE[1] / _WIDTH_RANGE[0])
-        cosine = np.sqrt(length**2 + w**2) / (2 * self.coat)
-        low, high = 1e3 / _LONGEST, 1e3 / _SHORTEST
         for q, eta in zip(self.frequencies, self.powers, strict=True):
-            if not q.any():  # `mirror`
-                continue
             c = u @ q / length**2
-            offset = q @ q - (c * length) ** 2
-            visible = np.clip(c, low, high)
-            kappa = 2 * np.pi * w * visible / self.max_kappa
-            power = np.interp(kappa, np.linspace(0, 1, len(eta)), eta)
-            power *= _interpolated(self.reflectance[..., None], cosine, (visible - low) / (high - low))[:, 0]
-            power *= np.exp(-np.maximum(offset, 0) / (2 * self.lobe_width**2)) * np.minimum(s, 1)
-            power *= (c > 0) & (c < _MAX_CENTRE)
-            total += power[:, None] * _interpolated(self.light, row, c / _MAX_CENTRE) / (2 * np.pi * self.lobe_width**2)
+            square = np.maximum(q @ q - (c * length) ** 2, 0) / self.lobe_width**2
+            lobe = np.exp(-square / 2) / (2 * np.pi * self.lobe_width**2)
+            near, is_wide = square < _CUTOFF**2, s > _MAX_SINGLE
+            for rows, of in (near & ~is_wide & (c > 0) & (c < _MAX_CENTRE), self._narrow), (near & is_wide, self._wide):
+                total[rows] += lobe[rows, None] * of(eta, c[rows], s[rows], u[rows], w[rows])
         return total
+
+    def _narrow(self, eta: Real, c: Real, s: Real, u: Real, w: Real) -> Real:
+        """Return the colour of an order whose factor is that in the middle of its lobe, (n, 3)."""
+        return self._factor(eta, c, u, w)[:, None] * self._gaussian(c, s)
+
+    def _wide(self, eta: Real, c: Real, s: Real, u: Real, w: Real) -> Real:
+        """Return the colour of an order whose factor varies within its lobe, (n, 3)."""
+        p, correction = _WIDTH_RANGE[1], _PER_SPACING**2 / 2
+        both = s**2 + p**2
+        total = light = np.zeros((len(c), 3))
+        factor = np.zeros((len(c), 1))
+        for nu in _LOW + _SPACING * (np.arange(_NODES) - 0.5):
+            before, light_before = factor, light
+            weight = np.exp(-((c - nu) ** 2) / (2 * both)) / (np.sqrt(2 * np.pi) * _PER_SPACING)
+            weight *= np.abs(c - nu) <= _CUTOFF * np.sqrt(both)
+            light = weight[:, None] * self._gaussian((c * p**2 + nu * s**2) / both, s * p / np.sqrt(both))
+            factor = self._factor(eta, np.full(len(c), nu), u, w)[:, None]
+            pairs = before * light + factor * light_before
+            total = total + (1 + 2 * correction) * factor * light - correction * pairs
+        return total
+
+    def _factor(self, eta: Real, nu: Real, u: Real, w: Real) -> Real:
+        """Return η R/R_0 at ν, that of the nearest visible light."""
+        visible = np.clip(nu, _LOW, _HIGH)
+        power = np.interp(2 * np.pi * w * visible / self.max_kappa, np.linspace(0, 1, len(eta)), eta)
+        cosine = np.sqrt((u**2).sum(axis=-1) + w**2) / (2 * self.coat)
+        return power * _interpolated(self.reflectance[..., None], cosine, (visible - _LOW) / (_HIGH - _LOW))[:, 0]
+
+    def _gaussian(self, c: Real, s: Real) -> Real:
+        """Return the colour of a Gaussian of light, (n, 3)."""
+        narrow, wide = _WIDTH_RANGE
+        return s[:, None] * _interpolated(self.light, np.log(s / narrow) / np.log(wide / narrow), c / _MAX_CENTRE)
 
 
 def colours_of(viewed: Viewed) -> ColourTable | OrderColours:
@@ -316,24 +342,15 @@ def _orders(viewed: Viewed) -> OrderColours:
     if (count := int(kept.sum())) > MAX_ORDERS:
         wanted = f"wanted at most {MAX_ORDERS}; with a smaller coherence_length they overlap"
         raise RequestError(f"{spectrum.source}: got {count} separate orders, {wanted}")
-    row, column = np.argwhere(length == 0)[0]
-    kept[row, column] = True
+    kept |= length == 0
     narrow, wide = _WIDTH_RANGE
-    nu = np.linspace(1e3 / _LONGEST, 1e3 / _SHORTEST, 1441)
+    nu = np.linspace(_LOW, _HIGH, 1441)
     # E dλ = E dν/ν²; with λ⁻² of C, 1000 nm/µm are left.
     of_light = np.array([viewed.reflected(1 / n, np.ones(())) for n in nu])[:, None] * _per_nm(1e3 / nu) * 1e3
     c, s = np.linspace(0, _MAX_CENTRE, _CENTRES), np.geomspace(narrow, wide, _WIDTHS)
-    light = np.stack([np.exp(-0.5 * ((nu - c[:, None]) / width) ** 2) @ of_light / min(width, 1) for width in s])
+    light = np.stack([np.exp(-0.5 * ((nu - c[:, None]) / width) ** 2) @ of_light / width for width in s])
     cosines, some = np.linspace(0, 1, _COSINES), np.linspace(nu[0], nu[-1], _COSINES)
     reflectance = np.stack([viewed.reflected(1 / n, cosines) / viewed.reflected(1 / n, np.ones(())) for n in some], 1)
-    w, x = np.linspace(*viewed.range_w, _COSINES), np.linspace(0, OrderColours.max_mirror, _KAPPAS)
-    u = np.stack([x * spectrum.lobe_width, np.zeros_like(x)], -1)
-    mirror = np.zeros((len(w), len(x), 3))
-    for wavelength, colour in _light(_STEP):
-        for layer, w_of_layer in zip(mirror, w, strict=True):
-            lobe = np.exp(-((x / wavelength) ** 2) / 2) / (2 * np.pi * spectrum.lobe_width**2)
-            power = viewed.powers(2 * np.pi * w_of_layer / wavelength)[row, column] / wavelength**2
-            layer += (power * lobe * viewed.reflectance(wavelength, u, w_of_layer))[:, None] * colour
     return OrderColours(
         q[kept],
         grid.tile_size,
@@ -342,8 +359,6 @@ def _orders(viewed: Viewed) -> OrderColours:
         spectrum.lobe_width,
         light * (nu[1] - nu[0]),
         reflectance,
-        mirror,
-        viewed.range_w,
         viewed.coat,
     )
 

@@ -34,14 +34,14 @@ def test_a_file_holds_the_colours(kind, tmp_path, monkeypatch):
         values = random.integers(0, 2**32, (2, 4, 4), dtype=np.uint32)
         colours = ColourTable(values, 0.15, (0.3, 3.1), error)
     else:
-        shapes = ((3, 2), (3, 5), (2, 6, 3), (4, 4), (2, 7, 3))
-        q, powers, light, reflectance, mirror = (random.random(shape) for shape in shapes)
-        colours = OrderColours(q, (2.5, 1.0), powers, 60.0, 0.003, light, reflectance, mirror, (0.3, 3.1), 1.55, error)
+        shapes = ((3, 2), (3, 5), (2, 6, 3), (4, 4))
+        q, powers, light, reflectance = (random.random(shape) for shape in shapes)
+        colours = OrderColours(q, (2.5, 1.0), powers, 60.0, 0.003, light, reflectance, 1.55, error)
     monkeypatch.setattr(colour_file, "colours_of", lambda viewed: colours)
     spectrum = md.precompute(md.gratings.blazed(5.0, 0.25))
     write_colours(Viewed(spectrum, MediumBelow.of(None, 1.5), 1.55), tmp_path / "a.bin", "radial", "#a0522d")
     header, arrays = read(tmp_path / "a.bin")
-    assert (header["version"], header["kind"], header["source"]) == (2, kind, spectrum.source)
+    assert (header["version"], header["kind"], header["source"]) == (3, kind, spectrum.source)
     assert header["error"] == {"mean": 0.1, "percentile_95": 0.2, "maximum": 3.0, "flux": 0.01}
     assert (header["orientation"], header["base"], header["coat"]) == ("radial", "#a0522d", 1.55)
     assert header["index"] == pytest.approx(1.5 / 1.55)

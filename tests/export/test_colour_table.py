@@ -116,6 +116,17 @@ def test_a_look_up_has_the_colour_of_the_bsdf(name, llvm):
     assert colours.error.is_small
 
 
+@pytest.mark.few(1)
+@pytest.mark.parametrize("length", [14.0, 9.0, 25.0, 40.0])
+def test_lobes_of_any_width_have_the_colour_of_the_integral(length, monkeypatch):
+    monkeypatch.setattr(colour_table, "PAIRS", 400)
+    recipe = md.Recipe.load(md.examples_folder() / "precompute" / "blaze.toml")
+    recipe = replace(recipe, settings=replace(recipe.settings, coherence_length=length))
+    surface = Viewed(recipe.cached(), MediumBelow.of("Au"))
+    assert surface.has_separate_orders
+    assert colours_of(surface).error.is_small
+
+
 def test_three_numbers_have_nine_bits_and_an_exponent():
     rng = np.random.default_rng(1)
     values = rng.uniform(size=(500, 3)) * 10.0 ** rng.uniform(-3, 4, (500, 1))

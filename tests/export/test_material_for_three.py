@@ -256,10 +256,10 @@ def test_a_file_that_cannot_be_read_is_grey_and_says_so_once(exported, folder, t
     exported("blaze")
     content = (folder / "blaze.bin").read_bytes()
     (folder / "short.bin").write_bytes(content[:-100])
-    (folder / "later.bin").write_bytes(content.replace(b'"version": 2', b'"version": 9'))
+    (folder / "later.bin").write_bytes(content.replace(b'"version": 3', b'"version": 9'))
     (folder / "other.bin").write_bytes(b"glTF" + content[4:])
     shown = {"eye": EYE.tolist(), "position": [0, 0, 3], "size": 8, "material": {}, "light": "directional"}
-    wanted = {"short": "the file was cut short", "later": "version 9, wanted 2", "other": "not a file of colours"}
+    wanted = {"short": "the file was cut short", "later": "version 9, wanted 3", "other": "not a file of colours"}
     for name, problem in wanted.items():
         grey = call(tab, "plane", f"{name}.bin", shown)[27, :3]
         assert np.ptp(grey) < 1e-3 < grey.min()

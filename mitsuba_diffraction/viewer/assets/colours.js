@@ -5,7 +5,7 @@
 const TABLES = [{ size: 64, layers: 6, wavelengths: 20 }, { size: 128, layers: 13, wavelengths: 30 }];
 const STRETCH = 0.15;  // a
 const MIN_W = 0.15;
-const CENTRES = 512, WIDTHS = 24, COSINES = 16, DISTANCES = 65;  // of the colours of separate orders
+const CENTRES = 512, WIDTHS = 12, COSINES = 16;  // of the colours of separate orders
 const MAX_ORDER_WIDTH = 0.014;  // cycles/um, of overlapping lobes that are added up, as a table would be too coarse
 
 class Colours {
@@ -94,7 +94,7 @@ class Colours {
 
   ofOrders(state) {
     const { gl } = this;
-    const [uGaussians, uRatios, uMirror] = [[CENTRES, WIDTHS], [COSINES, COSINES], [DISTANCES, COSINES]].map(([width, height], k) => {
+    const [uGaussians, uRatios] = [[CENTRES, WIDTHS], [COSINES, COSINES]].map(([width, height], k) => {
       const made = texture(gl, gl.TEXTURE_2D);
       gl.texStorage2D(gl.TEXTURE_2D, 1, gl.RGBA16F, width, height);
       this.draw(state, k + 1, 90, [width, height], {}, () =>
@@ -103,7 +103,7 @@ class Colours {
     });
     const perNu = 2 * Math.PI * 0.8 * this.rangeW(state)[1] * state.heightScale;
     const drawn = drawnOfOrders((order, nu) => this.spectrum.powerAt(order, perNu * nu), this.spectrum.spectrum.max_order);
-    return { uGaussians, uRatios, uMirror, uDrawn: numbers2D(gl, drawn, SAMPLES, 1, 4) };
+    return { uGaussians, uRatios, uDrawn: numbers2D(gl, drawn, SAMPLES, 1, 4) };
   }
 
   // A part of table.glsl.
@@ -115,7 +115,7 @@ class Colours {
     gl.viewport(0, 0, ...size);
     program.use({
       ...spectrum.uniforms(state), ...wavelengthsOf(state, spectrum.materials[state.material], wavelengths),
-      uMatching: renderer.matching, uRangeW: this.rangeW(state), uSize: size, ...uniforms,
+      uMatching: renderer.matching, uSize: size, ...uniforms,
     });
     renderer.quad();
   }

@@ -33,7 +33,7 @@ float continuumFactor(vec3 wi, vec3 wo, vec2 tangent, float perWidth) {
   float square = dot(tangent, tangent);
   float mirror = clamp((25.0 - square * perWidth * perWidth) / 9.0, 0.0, 1.0);
   mirror *= clamp(2.0 - 5.0 * sqrt(max(max(squares.x, squares.y), 1e-12)), 0.0, 1.0);  // zero unless both are grazing
-  float gain = mirror > 0.0 ? squaresAndGain(wi, wo, vec2(0.0), perWidth).z : 0.0;
+  float gain = mirror > 0.0 ? squaresAndGain(wi, wo, vec2(0.0), perWidth, 0.0).z : 0.0;
   return mix(kG(squares, square), gain, mirror);
 }
 
@@ -99,7 +99,7 @@ float overlapping(vec3 wi, vec3 wo, vec2 q, float x, float lambda) {
       vec2 lobes = lobe(vec2(m), q);
       float weight = lobes.x * lobes.y;
       if (weight == 0.0) continue;
-      if (KIND == LINES) weight *= orderFactor(wi, wo, vec2(m) / uPerPitch * lambda, 1.0 / (lambda * uSigma));
+      if (KIND == LINES) weight *= orderFactor(wi, wo, vec2(m) / uPerPitch * lambda, 1.0 / (lambda * uSigma), 0.0);
       sum += weight * node(m, interval);
     }
   }
@@ -111,7 +111,7 @@ float resolved(vec3 wi, vec3 wo, ivec2 m, vec2 q, float x, float lambda) {
   if (any(greaterThan(abs(m), uMaxOrder))) return 0.0;
   vec2 lobes = lobe(vec2(m), q);
   if (lobes.x * lobes.y == 0.0) return 0.0;
-  float factor = orderFactor(wi, wo, vec2(m) / uPerPitch * lambda, 1.0 / (lambda * uSigma));
+  float factor = orderFactor(wi, wo, vec2(m) / uPerPitch * lambda, 1.0 / (lambda * uSigma), 0.0);
   return factor == 0.0 ? 0.0 : max(lobes.x * lobes.y * factor * power(m, x), 0.0);
 }
 

@@ -1,5 +1,5 @@
-// What shading.js looks up: C at the nodes of a layer of w, or for separate orders (PART 1 to 3) the colours of Gaussians of
-// light, R relative to that at normal incidence, and order 0. Light is x, y, z times E over nm.
+// What shading.js looks up: C at the nodes of a layer of w, or for separate orders (PART 1 and 2) the colours of Gaussians
+// of light, and R relative to that at normal incidence. Light is x, y, z times E over nm.
 uniform highp sampler2D uMatching;    // x, y, z and the light at each nm from 360
 uniform vec4 uSpectrum[WAVELENGTHS];  // x, y, z times light times distance in nm, and lambda in nm
 uniform vec2 uIndices[WAVELENGTHS];   // n + ik there
@@ -41,18 +41,10 @@ void main() {
     float nu = low + step * (float(j) + 0.5), d = (nu - c) / s;
     total += exp(-0.5 * d * d) * reflectance(1.0, 1e3 / nu) * lightAt(1e3 / nu);
   }
-  total *= 1e3 * step / min(s, 1.0);
-#elif PART == 2
+  total *= 1e3 * step / s;
+#else
   float nm = 1e3 / mix(LOW, HIGH, place.x);
   total = vec3(reflectance(max(place.y, 1e-3), nm) / reflectance(1.0, nm));
-#else
-  float x = MAX_MIRROR * place.x, w = mix(uRangeW.x, uRangeW.y, place.y);
-  float cosine = min(0.5 * length(vec2(x * uSigma, w)) / uCoat, 1.0);
-  for (int j = 0; j < WAVELENGTHS; j++) {
-    float frequency = 1e3 / uSpectrum[j].w, at = x * frequency;
-    float power = orderPower(ivec2(0), 2.0 * PI * w * frequency * uHeightScale) * frequency * frequency;
-    total += exp(-0.5 * at * at) * power * reflected(cosine, j) * uSpectrum[j].xyz;
-  }
 #endif
   oColour = vec4(max(total, 0.0), 1.0);
 }

@@ -6,7 +6,7 @@ import {
 } from 'three';
 import { SHADING, drawnOfTable } from './shading.js';
 
-const VERSION = 2;
+const VERSION = 3;
 const SAMPLES = 256;  // of a sky, by a table
 const [LOW, HIGH, WAVELENGTHS, MAX_ORDERS] = [1000 / 740, 1000 / 380, 12, 170];  // a texture has 2048 texels
 const FROM_RADIUS = { radial: 0, tangential: 90 };
@@ -31,7 +31,7 @@ export class DiffractionData {
     Object.assign(this, header);
     const own = this.kind === 'table' ? this.#table(arrays.values) : this.#orders(arrays);
     this.uniforms = {
-      uCoat: this.coat, uEta: this.index, uMinCosine: this.min_cosine * (1 - 1e-6), uRangeW: new Vector2(...this.range_w), ...own,
+      uCoat: this.coat, uEta: this.index, uMinCosine: this.min_cosine * (1 - 1e-6), ...own,
     };
   }
 
@@ -45,10 +45,10 @@ export class DiffractionData {
     const uColours = new DataArrayTexture(halves, size, size, layers);
     Object.assign(uColours, { format: RGBAFormat, type: HalfFloatType, magFilter: LinearFilter });
     Object.assign(uColours, { minFilter: LinearMipmapLinearFilter, generateMipmaps: true, needsUpdate: true });
-    return { uColours, uStretch: this.stretch, uDrawn: loaded(drawnOfTable(sums, size, this.stretch, SAMPLES), SAMPLES, 1) };
+    return { uColours, uRangeW: new Vector2(...this.range_w), uStretch: this.stretch, uDrawn: loaded(drawnOfTable(sums, size, this.stretch, SAMPLES), SAMPLES, 1) };
   }
 
-  #orders({ frequencies, powers, light, reflectance, mirror }) {
+  #orders({ frequencies, powers, light, reflectance }) {
     const T = this.tile_size, columns = powers.shape[1], orders = [];
     for (let k = 0; k < powers.shape[0]; k++) orders.push([0, 1].map((i) => Math.round(frequencies.values[2 * k + i] * T[i])));
     const [M, N] = [0, 1].map((i) => Math.max(...orders.map((m) => Math.abs(m[i]))));
@@ -64,13 +64,11 @@ export class DiffractionData {
       return [...orders[Math.floor((k >> 2) / WAVELENGTHS)], nu, (count * step) / nu ** 2][k & 3];
     });
     this.skyPoints = count;
-    const scaled = mirror.values.map((x) => x * 2 * Math.PI * this.lobe_width ** 2);
     return {
       uPowers: loaded(all, columns, rows), uMaxKappa: this.max_kappa, uSigma: this.lobe_width,
       uPerPitch: new Vector2(...T), uMaxOrder: new Vector2(M, N), uDrawn: loaded(sky, count, 1),
       uGaussians: interpolated(light.values, light.shape[1], light.shape[0], 3),
       uRatios: interpolated(reflectance.values, reflectance.shape[1], reflectance.shape[0], 1),
-      uMirror: interpolated(scaled, mirror.shape[1], mirror.shape[0], 3),
     };
   }
 }

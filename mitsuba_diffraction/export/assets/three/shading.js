@@ -8,7 +8,6 @@ export const SHADING = /* glsl */ `
 uniform float uCoat;       // index of a clear layer over the relief; one without
 uniform float uEta;        // index of the material relative to the layer
 uniform float uMinCosine;  // next to the relief
-uniform vec2 uRangeW;      // of the first and the last layer
 uniform float uHeightScale;
 uniform vec2 uPerPitch;    // T of orders
 uniform ivec2 uMaxOrder;
@@ -69,20 +68,27 @@ float horizonGain(float x) {
   return 1.0 + t * t * p;
 }
 
-// cos^2 of both directions of an order at lambda q = change, and in z the gain of its lobe.
-vec3 squaresAndGain(vec3 wi, vec3 wo, vec2 change, float perWidth) {
+// cos^2 of both directions of an order at lambda q = change, and in z the gain of its lobe. The edge at its Rayleigh
+// anomaly is a ramp, as wide as nu times that number.
+vec3 squaresAndGain(vec3 wi, vec3 wo, vec2 change, float perWidth, float ramp) {
   float squareI = wi.z * wi.z, squareO = wo.z * wo.z;
   float orderO = squareI - dot(change, 2.0 * wi.xy + change);
   float orderI = squareO - dot(change, 2.0 * wo.xy + change);
-  float gain = 0.0;
-  if (min(orderI, orderO) > 0.0) {
-    gain = horizonGain(0.5 * perWidth * min(squareI, orderO)) * horizonGain(0.5 * perWidth * min(squareO, orderI));
+  float smaller = min(orderI, orderO), gain = float(smaller > 0.0);
+  if (ramp > 0.0) {
+    float slope = 2.0 * dot(change, (orderI < orderO ? wo.xy : wi.xy) + change);  // of that over log nu
+    gain = clamp(0.5 + smaller / max(abs(slope) * ramp, 1e-6), 0.0, 1.0);
+    orderI = max(orderI, 0.0);
+    orderO = max(orderO, 0.0);
+  }
+  if (gain > 0.0) {
+    gain *= horizonGain(0.5 * perWidth * min(squareI, orderO)) * horizonGain(0.5 * perWidth * min(squareO, orderI));
   }
   return vec3(0.5 * (squareI + orderI), 0.5 * (squareO + orderO), gain);
 }
 
-float orderFactor(vec3 wi, vec3 wo, vec2 tangent, float perWidth) {
-  vec3 found = squaresAndGain(wi, wo, tangent, perWidth);
+float orderFactor(vec3 wi, vec3 wo, vec2 tangent, float perWidth, float ramp) {
+  vec3 found = squaresAndGain(wi, wo, tangent, perWidth, ramp);
   return found.z > 0.0 ? kG(found.xy, dot(tangent, tangent)) * found.z : 0.0;
 }
 
@@ -97,17 +103,14 @@ float throughCoat(vec3 wi, vec3 wo) {
   return covered(wi, wo) ? (1.0 - face(wi.z)) * (1.0 - face(wo.z)) : 0.0;
 }
 
-float layerOf(float w) {
-  return clamp((w - uRangeW.x) / (uRangeW.y - uRangeW.x), 0.0, 1.0);
-}
-
 #ifdef ORDERS
 
 uniform highp sampler2D uGaussians;     // of a Gaussian of light, over its middle c and its width s, in 1/um
 uniform highp sampler2D uRatios;  // R relative to that at normal incidence, over nu and cos theta_h
-uniform highp sampler2D uMirror;    // C of order 0 times 2 pi sigma_q^2, over |u|/sigma_q and w
-const float MAX_CENTRE = 4.0, NARROW = 3e-3, WIDE = 30.0, MAX_MIRROR = 6.0 * 0.74;
-const float CUTOFF = 4.0;  // of lobes, in standard deviations
+const float MAX_CENTRE = 4.0, CUTOFF = 4.0;  // of lobes, and of their products with nodes, in standard deviations
+// Nodes of factors that vary within a lobe: see colour_table.py.
+const float NODES = 8.0, SPACING = (HIGH - LOW) / (NODES - 2.0), PER_SPACING = 1.0 / 1.7, MAX_SINGLE = 0.06;
+const float NARROW = 3e-3, WIDE = SPACING * PER_SPACING;  // s in uGaussians
 
 float orderPower(ivec2 m, float kappa);  // eta, of the program
 
@@ -126,34 +129,50 @@ float product(vec3 matrix, vec2 p, vec2 q) {
   return p.x * q.x * matrix.z - (p.x * q.y + p.y * q.x) * matrix.y + p.y * q.y * matrix.x;
 }
 
-// Of order m, its lobe Gaussian in nu: see OrderColours; nu in the covariance as at its middle.
+// Of order m, its lobe Gaussian in nu: see OrderColours; nu in the covariance as at its middle. A wide lobe has several
+// parts, each about a node.
 vec3 colourOfOrder(ivec2 m, vec3 wi, vec3 wo, vec2 u, float w, vec3 spread) {
   vec2 q = vec2(m) / uPerPitch;
-  float nu = clamp(dot(u, q) / max(dot(u, u), 1e-12), LOW, HIGH);
+  float nu = m == ivec2(0) ? 1.8 : clamp(dot(u, q) / max(dot(u, u), 1e-12), LOW, HIGH);
   vec3 matrix = nu * nu * spread + vec3(uSigma * uSigma, 0.0, uSigma * uSigma);
   float det = matrix.x * matrix.z - matrix.y * matrix.y;
   float inverse = max(product(matrix, u, u) / det, 1e-12), centre = product(matrix, u, q) / (det * inverse);
   vec2 rest = q - u * centre;  // |q|^2 - c^2 |u|^2 would lose its digits
   float exponent = -0.5 * product(matrix, rest, rest) / det;
-  vec3 result = vec3(0.0);
-  LOOP_IF(exponent > -0.5 * CUTOFF * CUTOFF && centre > 0.0 && centre < MAX_CENTRE) {
-    float s = inversesqrt(inverse), visible = clamp(centre, LOW, HIGH);
-    vec3 light = look(uGaussians, centre / MAX_CENTRE, log(s / NARROW) / log(WIDE / NARROW)) * min(s, 1.0);
-    float power = orderPower(m, 2.0 * PI * w * visible * uHeightScale) * relative(u, w, visible);
-    result = light * power * exp(exponent) * orderFactor(wi, wo, q / visible, visible / uSigma) / (2.0 * PI * sqrt(det));
+  float s = inversesqrt(inverse), both = sqrt(1.0 / inverse + WIDE * WIDE), first = 0.0, last = 0.0;
+  bool isWide = s > MAX_SINGLE;
+  if (isWide) {
+    float place = (centre - LOW) / SPACING + 0.5, reach = CUTOFF * both / SPACING;
+    first = max(ceil(place - reach), 0.0);
+    last = min(floor(place + reach), NODES - 1.0);
+  } else if (centre <= 0.0 || centre >= MAX_CENTRE) last = -1.0;
+  if (exponent < -0.5 * CUTOFF * CUTOFF) last = -1.0;
+  vec3 result = vec3(0.0), lightBefore = vec3(0.0);
+  float factorBefore = 0.0, correction = isWide ? 0.5 * PER_SPACING * PER_SPACING : 0.0;
+  for (float k = first; k <= last; k++) {
+    float nu = centre, middle = centre, width = s, weight = 1.0;
+    if (isWide) {
+      nu = LOW + (k - 0.5) * SPACING;
+      middle = mix(nu, centre, WIDE * WIDE / (both * both));
+      width = s * WIDE / both;
+      weight = exp(-0.5 * (centre - nu) * (centre - nu) / (both * both)) / (sqrt(2.0 * PI) * PER_SPACING);
+    }
+    float visible = clamp(nu, LOW, HIGH), factor = orderPower(m, 2.0 * PI * w * visible * uHeightScale);
+    factor *= relative(u, w, visible) * orderFactor(wi, wo, q / visible, visible / uSigma, isWide ? SPACING / visible : 0.0);
+    vec3 light = look(uGaussians, middle / MAX_CENTRE, log(width / NARROW) / log(WIDE / NARROW)) * (width * weight);
+    result += (1.0 + 2.0 * correction) * factor * light - correction * (factorBefore * light + factor * lightBefore);
+    factorBefore = factor;
+    lightBefore = light;
   }
-  return result;
+  return result * exp(exponent) / (2.0 * PI * sqrt(det));
 }
 
 // K G C, the mean over a part of a lamp: u has the covariance (a, b; b, c), and the lobe stays a Gaussian.
 vec3 coloursOf(vec3 wi, vec3 wo, vec3 spread) {
   vec2 u = -(wi.xy + wo.xy);
   float w = inner(wi.z) + inner(wo.z);
-  float variance = uSigma * uSigma, wide = variance + 1.62 * (spread.x + spread.z);  // at nu = 1.8
-  float x = length(u) / (sqrt(wide) * MAX_MIRROR);
   vec3 total = vec3(0.0);
-  LOOP_IF(x <= 1.0) total = look(uMirror, x, layerOf(w)) * orderFactor(wi, wo, vec2(0.0), 1.8 / uSigma) / (2.0 * PI * wide);
-  vec2 widths = CUTOFF * sqrt(variance + HIGH * HIGH * spread.xz) * uPerPitch, path = u * uPerPitch;
+  vec2 widths = CUTOFF * sqrt(uSigma * uSigma + HIGH * HIGH * spread.xz) * uPerPitch, path = u * uPerPitch;
   int axis = uMaxOrder.y == 0 || (uMaxOrder.x > 0 && abs(path.x) >= abs(path.y)) ? 0 : 1, across = 1 - axis;
   float along = path[axis], slope = abs(along) > 1e-6 ? path[across] / along : 0.0;
   int first = max(int(ceil(min(along * LOW, along * HIGH) - widths[axis])), -uMaxOrder[axis]);
@@ -165,7 +184,7 @@ vec3 coloursOf(vec3 wi, vec3 wo, vec3 spread) {
     float middle = slope * float(n);
     int from = max(int(ceil(middle - reach)), -uMaxOrder[across]), to = min(int(floor(middle + reach)), uMaxOrder[across]);
     for (int k = from; k <= to; k++) {
-      if (n != 0 || k != 0) total += colourOfOrder(axis == 0 ? ivec2(n, k) : ivec2(k, n), wi, wo, u, w, spread);
+      total += colourOfOrder(axis == 0 ? ivec2(n, k) : ivec2(k, n), wi, wo, u, w, spread);
     }
   }
   return total;
@@ -181,6 +200,7 @@ float partsOf(float size, vec2 u) {
 #else
 
 uniform highp sampler2DArray uColours;  // C; u = a sinh(x), layers over w
+uniform vec2 uRangeW;                   // of the first and the last layer
 uniform float uStretch;                 // a
 
 // The distances between nodes at u.
@@ -195,7 +215,7 @@ vec3 coloursOf(vec3 wi, vec3 wo, vec3 spread) {
   vec3 size = vec3(textureSize(uColours, 0));
   vec2 x = abs(u) / uStretch, warped = sign(u) * log(x + sqrt(x * x + 1.0)) / (2.0 * asinh(MAX_U / uStretch)) + 0.5;
   vec2 at = (clamp(warped, 0.0, 1.0) * (size.xy - 1.0) + 0.5) / size.xy;
-  float layer = layerOf(w) * (size.z - 1.0), below = min(floor(layer), size.z - 2.0);
+  float layer = clamp((w - uRangeW.x) / (uRangeW.y - uRangeW.x), 0.0, 1.0) * (size.z - 1.0), below = min(floor(layer), size.z - 2.0);
   vec2 texels = 2.0 * sqrt(spread.xz) / spacingAt(u);
   float level = log2(max(min(texels.x, texels.y), 1.0));
   vec3 low = textureLod(uColours, vec3(at, below), level).rgb, high = textureLod(uColours, vec3(at, below + 1.0), level).rgb;
@@ -274,7 +294,7 @@ vec3 ofSky(vec3 wo, int first, int count) {
 #ifdef ORDERS
       ivec2 m = ivec2(round(drawn.xy));
       float power = orderPower(m, 2.0 * PI * w * nu * uHeightScale) * relative(u, w, nu) * drawn.w / float(count);
-      power *= orderFactor(wi, wo, centre, nu / uSigma) / sqrt(2.0 * PI);
+      power *= orderFactor(wi, wo, centre, nu / uSigma, 0.0) / sqrt(2.0 * PI);
       vec3 XYZ = look(uGaussians, nu / MAX_CENTRE, 0.0) * power;  // the narrowest row is the light at nu
 #else
       vec3 XYZ = coloursOf(wi, wo, vec3(0.0)) * area;
