@@ -29,15 +29,17 @@ _ROWS, _COLUMNS = 32, 96  # of the cells of a continuum
 _SLICES = (17, 33, 65, 129)  # of κ
 _MAX_SLICE_ERROR = 2e-3  # of the reflected power, of orders; of a continuum, which has more values, ten times as much
 _COSINES, _AZIMUTHS, _LIGHTS = 12, 13, 5  # of the table of albedos of a continuum
-_MAX_HEIGHT_SCALE = 2.0
+_MAX_HEIGHT_SCALE = 2.0  # of a grating
+_MAX_SCALE_OF_PATCHES = 1.5  # which take longer; enough for the coat of a disc, which scales κ by its index
 
 
 def shader_recipe(recipe: Recipe) -> Recipe:
-    """Return the recipe of the spectrum of a shader: of a grating, one that allows for `_MAX_HEIGHT_SCALE`."""
+    """Return the recipe of the spectrum of a shader: of a grating or of patches, one that allows for larger heights."""
     settings = recipe.settings
-    if settings.extent != "tile" or recipe.patches > 1 or settings.wavelengths != VISIBLE:
+    if settings.extent != "tile" or settings.wavelengths != VISIBLE:
         return recipe
-    return replace(recipe, settings=replace(settings, wavelengths=wavelengths_inside(1.0, _MAX_HEIGHT_SCALE)))
+    scale = _MAX_HEIGHT_SCALE if recipe.patches == 1 else _MAX_SCALE_OF_PATCHES
+    return replace(recipe, settings=replace(settings, wavelengths=wavelengths_inside(1.0, scale)))
 
 
 @dataclass(frozen=True, eq=False)

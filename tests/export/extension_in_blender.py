@@ -64,7 +64,8 @@ def main(extension, tables, saved):
     settings.surface, settings.medium = "foil", "Au"
     bpy.ops.material.diffraction_create()
     messages = [refused(surface="file", file=other) for other in ("/gone.npz", extension, __file__)]
-    settings.surface, settings.medium, settings.coat = "compact_disc", "own", 1.55
+    coated = refused(surface="xenopeltis", medium="own", coat=1.55)
+    settings.surface = "compact_disc"
     files = {"coated": f"{saved[:-6]}_coated.blend", "exact": saved}
     for kind, file in files.items():
         settings.exact = kind == "exact"
@@ -77,8 +78,9 @@ def main(extension, tables, saved):
     for kind, file in files.items():
         bpy.ops.wm.open_mainfile(filepath=file)
         means[kind] = mean_of_picture(f"{file}.exr")
-    valid = is_valid(extension)
-    print("FOUND", json.dumps(dict(surfaces=found, messages=messages, means=means, exact=exact, valid=valid)))
+    found = {"surfaces": found, "messages": messages, "coated": coated, "means": means, "exact": exact}
+    found |= {"version": bpy.app.version[:2], "valid": is_valid(extension)}
+    print("FOUND", json.dumps(found))
 
 
 if __name__ == "__main__":

@@ -5,9 +5,10 @@ import numpy as np
 import pytest
 from scipy.special import jv
 
-from mitsuba_diffraction.export.shader_tables import bins_of_wavelengths
+from mitsuba_diffraction.export.shader_tables import SHORTEST_DRAWN, bins_of_wavelengths, shader_recipe
 from mitsuba_diffraction.export.working_spaces import WORKING_SPACES, nonnegative_colours
 from mitsuba_diffraction.files.outputs import check_outputs
+from mitsuba_diffraction.precomputation.requested_surface import RequestedSurface
 
 PERIOD, DEPTH = 1.6, 0.15
 
@@ -28,6 +29,12 @@ def test_the_tables_of_a_grating_are_its_closed_form(command, tmp_path):
     for colours in tables["colours"]:
         assert colours.min() >= 0
         np.testing.assert_allclose(colours.mean(axis=0), 1, atol=1e-5)
+
+
+@pytest.mark.parametrize("disc", ["compact_disc", "dvd"])
+def test_the_tables_of_a_disc_are_for_light_inside_its_coat(disc):
+    recipe = shader_recipe(RequestedSurface.of(disc).recipe)
+    assert recipe.settings.wavelengths[0] < SHORTEST_DRAWN / 1.58  # polycarbonate
 
 
 def test_mixtures_of_neighbouring_wavelengths_keep_luminance_and_colour():

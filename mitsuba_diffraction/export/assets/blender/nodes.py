@@ -59,11 +59,12 @@ def working_space() -> str:
 
 def new_material(name: str, tables: Mapping[str, np.ndarray]) -> tuple[bpy.types.Material, bpy.types.ShaderNode]:
     """Return a material of these tables, and its group."""
+    tree = node_group(name, tables)
     material = bpy.data.materials.new(name)
     material.use_nodes = True
     material.node_tree.nodes.clear()
     group = material.node_tree.nodes.new("ShaderNodeGroup")
-    group.node_tree = node_group(name, tables)
+    group.node_tree = tree
     return finished(material, group)
 
 
@@ -93,7 +94,14 @@ def add_star(tree: bpy.types.NodeTree, group: bpy.types.ShaderNode) -> None:
 
 
 def node_group(name: str, tables: Mapping[str, np.ndarray]) -> bpy.types.NodeTree:
-    """Return a new group of these tables."""
+    """Return a new group of these tables.
+
+    Raises:
+        ValueError: if they have no powers for the shortest wavelength inside the coat, or for the working space.
+    """
+    coat, max_scale = float(tables.get("coat", 1.0)), float(tables["max_height_scale"])
+    if coat > max_scale * (1 + 1e-6):
+        raise ValueError(f"got a coat of index {coat:.3g}; these tables are for one of up to {max(max_scale, 1):.3g}")
     tree = bpy.data.node_groups.new(name, "ShaderNodeTree")
     for label, kind, value, limits, tip in INPUTS:
         socket = tree.interface.new_socket(label, in_out="INPUT", socket_type=kind)
@@ -103,7 +111,7 @@ def node_group(name: str, tables: Mapping[str, np.ndarray]) -> bpy.types.NodeTre
         if limits:
             socket.min_value, socket.max_value = limits
         if label == "HeightScale":
-            socket.max_value = float(tables["max_height_scale"])
+            socket.max_value = max_scale / coat
     tree.interface.new_socket("BSDF", in_out="OUTPUT", socket_type="NodeSocketShader")
     _Grating(tree, name, tables).build()
     return tree
