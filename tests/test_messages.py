@@ -9,6 +9,7 @@ import mitsuba as mi
 import pytest
 
 import mitsuba_diffraction
+from mitsuba_diffraction import progress
 from mitsuba_diffraction.precomputation.recipe import Recipe
 from mitsuba_diffraction.render.scene_file import SceneFile
 
@@ -151,8 +152,9 @@ def test_a_bug_keeps_its_traceback(monkeypatch, llvm):
         mi.load_dict({"type": "diffraction_grating", "profile": "blazed", "period": 2.5, "depth": 0.25})
 
 
-def test_the_log_is_plain_text(caplog, capfd, llvm, command, tmp_path):
+def test_the_log_is_plain_text(caplog, capfd, llvm, command, monkeypatch, tmp_path):
     """One line each, without colours and places in the code; Mitsuba's own log has both, in files too."""
+    monkeypatch.setattr(progress, "MIN_REPORTED_SECONDS", 1e6)  # a slow machine says how far it is
     start = "diffraction_grating, blazed grating, period 0.8 µm, depth 0.4"
     bsdf = {"type": "diffraction_grating", "profile": "blazed", "period": 0.8, "depth": 0.4}
     mi.load_dict({"type": "scene", "sensor": {"type": "perspective"}, "plate": {"type": "rectangle", "bsdf": bsdf}})
