@@ -91,10 +91,6 @@ class OrderSampler:
         side_bins = np.sqrt(entries / (np.sqrt(len(ranges)) * self.slices * orders.prod()))
         self.side_bins = int(np.clip(side_bins, MIN_SIDE_BINS, MAX_SIDE_BINS))
         self.layout = Layout(0.0, 1, self.side_bins, 1, self.slices + 1, (first, last))
-        self.dispersion = 0.0
-        if stack is not None and not is_sheet:
-            indices = stack.below(stack.outside / np.linspace(first, last, 50)).real / stack.outside
-            self.dispersion = 2 * float(np.abs(indices - self.eta).max())
         borders = direction_borders(self.side_bins, 4)
         low, high = borders.min(1), borders.max(1)
         sums, bins, fractions, start = [], [], [], 0
@@ -191,9 +187,9 @@ class OrderSampler:
         """
         _, wavelengths = self.layout.directions(np.array([[slice_, 0, 0], [slice_ + 1, 0, 0]], np.float64))
         per_wavelength = self.tile / wavelengths[:, None]
-        # With a margin for curved borders and for an index that changes by `MAX_INDEX_CHANGE`.
+        # With a margin for curved borders, dispersion, and an index that changes by `MAX_INDEX_CHANGE`.
         half = self._indices(above == reflects)[1] * per_wavelength + 1e-3
-        half += (1e-3 + 2 * MAX_INDEX_CHANGE * max(self.eta, 1) + self.dispersion) * per_wavelength.max()
+        half += (1e-3 + 2 * MAX_INDEX_CHANGE * max(self.eta, 1)) * per_wavelength.max()
         first, last = (
             -self._indices(above)[1] * omega[:, None] * per_wavelength + sign * half
             for omega, sign in ((high, -1), (low, 1))

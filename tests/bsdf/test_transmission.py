@@ -8,15 +8,16 @@ import numpy as np
 import pytest
 import scipy.special
 import scipy.stats
-from bsdf_support import check_chi_square, direction, interaction, random_directions, six_samples, use, vectors
+from bsdf_support import check_chi_square, direction, floats, interaction, random_directions, six_samples, use, vectors
 from covering import covering
 
 import mitsuba_diffraction as md
 from mitsuba_diffraction import testing
+from mitsuba_diffraction.bsdf.device_tables import on_device
 from mitsuba_diffraction.bsdf.directions import Geometry, Incidence, Interface
 from mitsuba_diffraction.bsdf.order_sampler import OrderSampler
 from mitsuba_diffraction.optics.film_stack import Stack
-from mitsuba_diffraction.optics.materials import constant
+from mitsuba_diffraction.optics.materials import RefractiveIndex, constant
 
 PERIOD, ETA, WAVELENGTH = 3.35, 1.5, 0.5
 IMPORTANCE = mi.TransportMode.Importance
@@ -245,6 +246,34 @@ def test_reflected_and_transmitted_orders_are_drawn_with_their_probabilities(pro
     k = np.array(k_i.tangent).ravel() + WAVELENGTH * np.stack([m_x, m_y], -1) / spectrum.grid.tile_size
     propagates = ((k**2).sum(-1) < np.array(k_o.index)[0] ** 2).ravel()
     assert (share[propagates] > 0).all()
+
+
+def test_all_orders_that_propagate_in_a_medium_with_dispersion_can_be_drawn():
+    """At any wavelength, where n may be other than in the middle of visible light."""
+    period, count = 10.0, 1 << 19
+    nm = np.arange(340, 861.0)
+    medium = RefractiveIndex("dispersive", 1e-3 * nm, 1.46 + 0.02 / (1e-3 * nm) ** 2 + 0j)
+    spectrum = md.precompute(md.gratings.sinusoidal(period, 0.2), wavelengths=(205.0, 830.0), tolerance=0.01)
+    table = OrderSampler(spectrum, Stack(1.0, medium))
+    rng = np.random.default_rng(6)
+    omega, wavelength = random_directions(rng, count, least=0.0), rng.uniform(0.36, 0.83, count)
+    above, reflects = rng.random((2, count)) < 0.5
+    omega[~above, 2] *= -1
+    n, kappas = medium(wavelength).real, (mi.Float(1.0), mi.Float(1.0))
+    interface = Interface(eta=floats(n), kappas=kappas, transmitted_fraction=table.transmitted_fraction)
+    k_i = interface.wave_vector(vectors(omega))
+    incidence = Incidence.of(k_i, interface.scattered(k_i, on_device(reflects, mi.Bool)), interface)
+    incidence = incidence.at(floats(wavelength))
+    # The first and the last order, by the grating equation.
+    n_i, n_o = (np.where(of_side, 1, n) for of_side in (above, above == reflects))
+    square = n_o**2 - (n_i * omega[:, 1]) ** 2
+    for sign in (-1, 1):
+        m = period / wavelength * (-n_i * omega[:, 0] + sign * np.sqrt(np.maximum(square, 0)))
+        m = -sign * np.ceil(-sign * m)
+        exists = (square > 0) & (np.abs(m) <= spectrum.grid.max_order[0])
+        assert exists.sum() > count / 4
+        probability = np.array(table.probability(on_device(m, mi.Int32), mi.Int32(0), incidence, mi.Bool(True)))
+        assert (probability[exists] > 0).all()
 
 
 @pytest.mark.slow  # of an index and heights that change, other tests have the values and the sampler
