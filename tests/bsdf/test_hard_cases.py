@@ -1,14 +1,19 @@
 """Extreme surfaces and directions: tables and BSDF are right to the tolerance, compared with `md.reference`."""
 
+import drjit as dr
+import mitsuba as mi
 import numpy as np
 import pytest
+from bsdf_support import floats
 from hypothesis import example, given, settings
 from hypothesis import strategies as st
 from scipy.special import jv
 from test_bsdf import evaluate, k_g, random_directions, raw_plugin, towards
 
 import mitsuba_diffraction as md
+from mitsuba_diffraction.bsdf.indices import Dispersion
 from mitsuba_diffraction.optics.geometry import horizon_gain
+from mitsuba_diffraction.optics.materials import index_of
 from mitsuba_diffraction.settings import lobe_width
 from mitsuba_diffraction.spectrum.grids import OrderGrid
 
@@ -311,3 +316,16 @@ def test_five_micrometres_are_rendered_with_bessel_orders():
         # κ in single precision, times 2.5 µm.
         np.testing.assert_allclose(got, jv(orders, kappa * 2.5) ** 2, atol=1e-3)
         assert got.max() > 8e-3
+
+
+@pytest.mark.parametrize("media", [["BK7"], ["water", "BK7"]])
+def test_indices_are_read_within_their_table_at_and_beyond_its_ends(llvm, capfd, media):
+    indices = [index_of("int_ior", name) for name in media]
+    table = Dispersion(indices, 1.0)
+    nm = [0.0, 1e-3, float(table.first[0]), 550.0, max(1e3 * index.wavelengths[-1] for index in indices), 1e9]
+    for number, index in enumerate(indices):
+        with dr.scoped_set_flag(dr.JitFlag.Debug, True):
+            found = table.at(table.position(floats(nm)), mi.UInt32(number))
+            dr.eval(found)
+        np.testing.assert_allclose(np.array(found), index(1e-3 * np.array(nm)), rtol=1e-5)
+    assert "out-of-bounds" not in capfd.readouterr().err

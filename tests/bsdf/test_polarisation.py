@@ -115,6 +115,27 @@ def test_the_reverse_direction_has_the_transposed_matrix(polarised, parameters):
     assert (np.linalg.norm(diffracted[1:], axis=0) <= diffracted[0] + 1e-5 * there[0, 0].max()).all()
 
 
+def test_a_relief_turned_over_has_the_matrices_of_the_other_side(polarised):
+    """Light in glass that a sinusoid reflects or transmits is light above a sinusoid in air below glass."""
+    wi, wo = directions()
+    wi, wo = np.concatenate([wi, wi], axis=1), np.concatenate([wo, wo * [[1], [1], [-1]]], axis=1)
+    over = np.array([[1], [-1], [-1]])
+    found = matrices(grating(int_ior=1.5, ext_ior=1.0, transmission="interface"), over * wi, over * wo)
+    expected = matrices(grating(int_ior=1.0, ext_ior=1.5, transmission="interface"), wi, wo)
+    for half in (slice(200), slice(200, None)):
+        brightness = expected[0, 0][:, half]
+        assert (brightness > 1e-2 * brightness.max()).mean() > 0.1
+        for of_stokes in (  # what does not depend on the axes
+            lambda m: m[0, 0],
+            lambda m: m[3, 3],
+            lambda m: np.hypot(m[0, 1], m[0, 2]),
+            lambda m: np.hypot(m[1, 0], m[2, 0]),
+            lambda m: m[1, 1] * m[2, 2] - m[1, 2] * m[2, 1],
+        ):
+            a, b = of_stokes(found)[:, half], of_stokes(expected)[:, half]
+            np.testing.assert_allclose(a, b, rtol=2e-3, atol=2e-4 * np.abs(b).max())
+
+
 def powers(cosine, index):
     """Return R_s and R_p of a dielectric, (2, n)."""
     within = np.sqrt(1 - (1 - cosine**2) / index**2)

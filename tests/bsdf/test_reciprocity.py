@@ -2,6 +2,7 @@
 
 import dataclasses
 
+import drjit as dr
 import mitsuba as mi
 import numpy as np
 import pytest
@@ -94,7 +95,7 @@ def pairs(transmits, below, lengths, wavelengths):
 
 @pytest.mark.filterwarnings("ignore:pixels of")
 @pytest.mark.parametrize(("surface", "mode", "variation"), list(rows()))
-def test_the_bsdf_is_reciprocal(llvm, medium, surface, mode, variation):
+def test_the_bsdf_is_reciprocal(llvm, medium, capfd, surface, mode, variation):
     bsdf, below, lengths = grating(surface, mode, variation, medium)
     of_glass = surface == "rigorous" and "transmission" in MODES[mode]
     wavelengths = {"rigorous": (610.0, 660.0, 700.0, 800.0)}.get(surface, (400.0, 480.0, 600.0, 750.0))
@@ -107,7 +108,9 @@ def test_the_bsdf_is_reciprocal(llvm, medium, surface, mode, variation):
         n_i = np.where(wi[:, 2:] > 0, 1, below(wavelengths))
         return value / (np.abs(wo[:, 2:]) * n_i**2)
 
-    forward, reverse = per_square(wi, wo), per_square(wo, wi)
+    with dr.scoped_set_flag(dr.JitFlag.Debug, True):  # also reports tables that are read outside of their memory
+        forward, reverse = per_square(wi, wo), per_square(wo, wi)
+    assert "out-of-bounds" not in capfd.readouterr().err
     # float32 of cosines next to the horizon, and of q at the edge of a lobe
     relative = 2e-3 + 3e-5 / np.minimum(np.abs(wi[:, 2:]), np.abs(wo[:, 2:])) ** 2
     scale = np.maximum(forward, reverse)

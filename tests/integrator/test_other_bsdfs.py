@@ -1,12 +1,17 @@
 """The integrator `diffraction_path` with the BSDFs of Mitsuba: it converges to the limit of `path`."""
 
+from types import SimpleNamespace
+
+import drjit as dr
 import mitsuba as mi
 import numpy as np
 import pytest
-from bsdf_support import bitmap
+from bsdf_support import WAVELENGTHS, array, bitmap, floats, random_directions
 from test_diffraction_path import SKY, SUN, assert_agree, blaze, plate, region_means, scene, tilted_normals
 
+from mitsuba_diffraction.bsdf.testing import interaction
 from mitsuba_diffraction.evaluation.validation.scene_pictures import reference_integrator
+from mitsuba_diffraction.integrator.paths import LightPaths
 
 
 def colors():
@@ -87,6 +92,32 @@ def above(bsdf, coherence_length):
 @pytest.mark.parametrize("name", BSDFS)
 def test_every_bsdf_of_mitsuba_converges_to_the_limit_of_path(name, llvm):
     assert_agree(above(BSDFS[name](), 1.5), 12, 1024)
+
+
+@pytest.mark.parametrize("side", [1, -1])
+@pytest.mark.parametrize(
+    "bsdf",
+    [
+        {"type": "dielectric", "int_ior": 1.5},
+        {"type": "dielectric", "int_ior": 0.8},
+        {"type": "thindielectric", "int_ior": 1.5},
+        {"type": "twosided", "bsdf": {"type": "conductor", "material": "none"}},
+        {"type": "null"},
+    ],
+)
+def test_a_path_from_the_light_keeps_its_power_at_a_surface_that_absorbs_nothing(llvm, bsdf, side):
+    """Whether it is reflected or refracted, from either medium; a scene in which the eye is outside hides a factor."""
+    rng = np.random.default_rng(8)
+    wi = random_directions(rng, 256)
+    u = floats(rng.random(256))
+    si = interaction(wi * [1, 1, side], WAVELENGTHS)
+    tracer = SimpleNamespace(gratings=SimpleNamespace(only=True, is_mixture=lambda si, active: mi.Bool(False)))
+    ray, power, specular = LightPaths._scatter(
+        tracer, si, mi.load_dict(bsdf), mi.Spectrum(1), mi.Bool(False), u, mi.Point2f(0.5), mi.Bool(True)
+    )
+    dr.eval(ray, power, specular)
+    assert np.array(specular).all()
+    np.testing.assert_allclose(array(power), 1, rtol=1e-4)
 
 
 @pytest.mark.slow
