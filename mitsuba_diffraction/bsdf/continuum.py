@@ -40,8 +40,8 @@ class SplineSpectrum:
         """As `Scattering.meets`: a continuum has no gaps."""
         return mi.Bool(True)
 
-    def evaluate(self, geometry: Geometry, incidence: Incidence, active: mi.Bool) -> tuple[mi.Float, mi.Float]:
-        """As `Scattering.evaluate`, with K and G of the pair of directions (`Geometry.continuum_factor`)."""
+    def power_and_density(self, geometry: Geometry, incidence: Incidence, active: mi.Bool) -> tuple[mi.Float, mi.Float]:
+        """As `Scattering.power_and_density`, with K and G of the pair of directions (`Geometry.continuum_factor`)."""
         q = geometry.tangent * incidence.frequency
         x, y = q.x * self.per_q_x, q.y * self.per_q_y
         m_x, m_y = mi.Int32(dr.round(x)), mi.Int32(dr.round(y))
@@ -50,7 +50,7 @@ class SplineSpectrum:
             m_x + (self.max_node_x + RIM - 1),
             spline_weights(x - mi.Float(m_x)),
             spline_weights(y - mi.Float(m_y)),
-            self.power.at(geometry.kappa(incidence.frequency), geometry.small()),
+            self.power.at_kappa(geometry.kappa(incidence.frequency), geometry.small()),
             active,
         )
         inside = active & (dr.abs(q.x) <= self.limit_x) & (dr.abs(q.y) <= self.limit_y)

@@ -251,17 +251,17 @@ def define() -> type:
         def eval_pdf(
             self, ctx: mi.BSDFContext, si: mi.SurfaceInteraction3f, wo: mi.Vector3f, active: mi.Bool = True
         ) -> tuple[mi.Spectrum, mi.Float]:
-            return self.layers.evaluate(ctx, si, wo, active)
+            return self.layers.eval_pdf(ctx, si, wo, active)
 
         def eval(
             self, ctx: mi.BSDFContext, si: mi.SurfaceInteraction3f, wo: mi.Vector3f, active: mi.Bool = True
         ) -> mi.Spectrum:
-            return self.layers.evaluate(ctx, si, wo, active)[0]
+            return self.layers.eval_pdf(ctx, si, wo, active)[0]
 
         def pdf(
             self, ctx: mi.BSDFContext, si: mi.SurfaceInteraction3f, wo: mi.Vector3f, active: mi.Bool = True
         ) -> mi.Float:
-            return self.layers.evaluate(ctx, si, wo, active)[1]
+            return self.layers.eval_pdf(ctx, si, wo, active)[1]
 
         def eval_diffuse_reflectance(self, si: mi.SurfaceInteraction3f, active: mi.Bool = True) -> mi.Spectrum:
             albedo = self.layers.albedo(si, mi.Bool(active))

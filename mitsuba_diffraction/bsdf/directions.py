@@ -86,7 +86,7 @@ class Interface:
             an `OrderSampler` draws orders. None for rigorous theory and where orders overlap: the fraction of a plane
             is used.
         disperses: whether the index of the coat or of the medium below varies with the wavelength. `coat_index` and
-            `eta` are given for the middle of visible light; `at` returns the indices at a wavelength.
+            `eta` are given for the middle of visible light; `at_wavelength` returns the indices at a wavelength.
     """
 
     def __init__(
@@ -108,7 +108,7 @@ class Interface:
         self._dispersions = dispersions
         self.disperses = any(dispersions)
 
-    def at(self, wavelength: mi.Float) -> Interface:
+    def at_wavelength(self, wavelength: mi.Float) -> Interface:
         """Return the interface with its indices at a wavelength in vacuum, nm."""
         if not self.disperses:
             return self
@@ -382,7 +382,7 @@ class Incidence:
     k_iz: mi.Float
     k_oz: tuple[mi.Float, mi.Float, mi.Float]
 
-    def at(self, wavelength: mi.Float, lobe_scale: mi.Float | float = 1.0) -> Incidence:
+    def at_wavelength(self, wavelength: mi.Float, lobe_scale: mi.Float | float = 1.0) -> Incidence:
         """Return the incidence at another wavelength (µm) and with scaled lobes, from the incidence at 1 µm."""
         frequency = dr.rcp(wavelength)
         return dataclasses.replace(

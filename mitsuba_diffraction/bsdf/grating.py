@@ -157,7 +157,7 @@ class Grating:
         return sin * x + cos * y, cos * x - sin * y
 
     @dr.syntax
-    def evaluate(
+    def value_and_density(
         self,
         si: mi.SurfaceInteraction3f,
         wo: mi.Vector3f,
@@ -165,7 +165,7 @@ class Grating:
         wo_is_sample: bool,
         transmission_probability: mi.Float,
     ) -> tuple[mi.UnpolarizedSpectrum, mi.Float]:
-        """Evaluate f cos θ_o and the density of `sample`.
+        """Return f cos θ_o and the density of `sample`.
 
         The transmittances of the front face of a coat and of the flat face of a sheet are not included.
 
@@ -185,11 +185,11 @@ class Grating:
         covered, si = self._covered(si)
         count = _count(covered)
         value, density = mi.UnpolarizedSpectrum(0.0), mi.Float(0.0)
-        height_scale, lateral_scale = self.scales.at(si, active)
+        height_scale, lateral_scale = self.scales.ratio_and_lateral(si, active)
         pending = mi.UInt32(0)
         for channel, in_lobe in enumerate(covered):
             if self.interface.disperses:
-                at = self.interface.at(si.wavelengths[channel])
+                at = self.interface.at_wavelength(si.wavelengths[channel])
                 u, v = -at.wave_vector(wi).tangent - at.wave_vector(wo).tangent
             frequency = lateral_scale * dr.rcp(self._above(si.wavelengths[channel]))
             in_lobe &= self.theory.scattering.meets(u * frequency, v * frequency, lateral_scale)
@@ -229,15 +229,15 @@ class Grating:
         within = smaller(*geometry.cosines()) >= self.min_cosine
         if self.interface.disperses:
 
-            def at(state: tuple, wavelength: mi.Float) -> tuple[_Pair, mi.Float | float]:
-                interface, si_of_one = self.interface.at(wavelength), mi.SurfaceInteraction3f(si)
+            def pair_at(state: tuple, wavelength: mi.Float) -> tuple[_Pair, mi.Float | float]:
+                interface, si_of_one = self.interface.at_wavelength(wavelength), mi.SurfaceInteraction3f(si)
                 si_of_one.wavelengths = mi.UnpolarizedSpectrum(wavelength)
                 of_one = self._pair(interface, *state)
                 return of_one, self.theory.reflectance(si_of_one, of_one[0], active)[0]
 
             # R is part of the loop, so that its derivative matters; Dr.Jit removes values that nothing uses.
             derived = dr.grad_enabled(self.theory.reflectance(si, geometry, active))
-            value, density = self._of_wavelengths(si, pending, at, (wi, wo, height_scale), lateral_scale, derived)
+            value, density = self._of_wavelengths(si, pending, pair_at, (wi, wo, height_scale), lateral_scale, derived)
             return dr.select(within, value, 0), density
 
         def constant(state: tuple, wavelength: mi.Float) -> tuple[_Pair, mi.Float | float]:
@@ -259,7 +259,7 @@ class Grating:
         self,
         si: mi.SurfaceInteraction3f,
         pending: mi.UInt32,
-        at: Callable[[tuple, mi.Float], tuple[_Pair, mi.Float | float]],
+        pair_at: Callable[[tuple, mi.Float], tuple[_Pair, mi.Float | float]],
         state: tuple,
         lateral_scale: mi.Float,
         derived: bool = False,
@@ -271,13 +271,13 @@ class Grating:
 
         Args:
             si, pending: see `_diffracted`.
-            at: returns the pair of directions, and a factor of the value, from `state` at a wavelength in nm.
+            pair_at: returns the pair of directions, and a factor of the value, from `state` at a wavelength in nm.
             state: all arrays with derivatives.
             lateral_scale: of lengths along the surface.
-            derived: whether the factor that `at` returns has derivatives by other arrays.
+            derived: whether the factor that `pair_at` returns has derivatives by other arrays.
         """
         value, density = mi.UnpolarizedSpectrum(0.0), mi.Float(0.0)
-        add_wavelength = functools.partial(self._add_wavelength, si, at)
+        add_wavelength = functools.partial(self._add_wavelength, si, pair_at)
         if dr.hint(derived or dr.grad_enabled(state, lateral_scale), mode="scalar"):
             for _ in range(len(value)):
                 pending, value, density = add_wavelength(state, lateral_scale, pending, value, density)
@@ -289,7 +289,7 @@ class Grating:
     def _add_wavelength(
         self,
         si: mi.SurfaceInteraction3f,
-        at: Callable[[tuple, mi.Float], tuple[_Pair, mi.Float | float]],
+        pair_at: Callable[[tuple, mi.Float], tuple[_Pair, mi.Float | float]],
         state: tuple,
         lateral_scale: mi.Float,
         pending: mi.UInt32,
@@ -301,9 +301,9 @@ class Grating:
         chosen = [first_bit == (1 << channel) for channel in range(len(value))]
         for channel in range(1, len(value)):
             wavelength = dr.select(chosen[channel], si.wavelengths[channel], wavelength)
-        (geometry, incidence, pair), factor = at(state, wavelength)
-        incidence = incidence.at(self._above(wavelength) / lateral_scale, lateral_scale)
-        power, probability = self.theory.evaluate(geometry, incidence, pair, pending != 0)
+        (geometry, incidence, pair), factor = pair_at(state, wavelength)
+        incidence = incidence.at_wavelength(self._above(wavelength) / lateral_scale, lateral_scale)
+        power, probability = self.theory.power_and_density(geometry, incidence, pair, pending != 0)
         square = dr.square(incidence.frequency)
         power *= square * factor
         value = value + mi.UnpolarizedSpectrum([dr.select(c, power, 0) for c in chosen])
@@ -324,7 +324,7 @@ class Grating:
         """
         _, si = self._covered(si)
         directions, interface = (si.wi, wo), self.interface
-        at = [interface.at(wavelength) for wavelength in si.wavelengths]
+        at = [interface.at_wavelength(wavelength) for wavelength in si.wavelengths]
         if interface.transmits and not interface.is_sheet and ctx.mode == mi.TransportMode.Radiance:
             # Radiance scales with n².
             vectors = [[of_channel.wave_vector(omega) for omega in directions] for of_channel in at]
@@ -401,12 +401,14 @@ class Grating:
             wavelength = dr.select(is_covered & (rank == chosen), si.wavelengths[channel], wavelength)
             rank += dr.select(is_covered, 1, 0)
         sin, cos = self.frame(si, active)
-        height_scale, lateral_scale = self.scales.at(si, active)
-        interface = interface.at(wavelength)
+        height_scale, lateral_scale = self.scales.ratio_and_lateral(si, active)
+        interface = interface.at_wavelength(wavelength)
         k_i = interface.wave_vector(rotated(si.wi, sin, cos))
         k_o = interface.scattered(k_i, reflects)
         incidence = Incidence.of(k_i, k_o, interface, height_scale)
-        incidence = incidence.at(dr.detach(self._above(wavelength) / lateral_scale), dr.detach(lateral_scale))
+        incidence = incidence.at_wavelength(
+            dr.detach(self._above(wavelength) / lateral_scale), dr.detach(lateral_scale)
+        )
         q, propagates = self.theory.scattering.sample(incidence, rest, v, active & ~uniform)
         tangent = k_o.tangent - incidence.wavelength * incidence.q_sign * q
         wo = rotated(mi.Vector3f(*tangent, 0), -sin, cos) / k_o.index

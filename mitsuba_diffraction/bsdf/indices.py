@@ -93,7 +93,7 @@ class Dispersion:
         node = dr.minimum(integer_part(x), integer_part(self.last) - 1)
         return node, x - mi.Float(mi.Int32(node))
 
-    def at(self, position: tuple[mi.UInt32, mi.Float], medium: mi.UInt32 | None = None) -> mi.Complex2f:
+    def index_at(self, position: tuple[mi.UInt32, mi.Float], medium: mi.UInt32 | None = None) -> mi.Complex2f:
         """Return n + ik at a `position`, of the first medium by default."""
         node, fraction = position
         if medium is not None:
@@ -102,7 +102,7 @@ class Dispersion:
 
     def __call__(self, wavelength: mi.Float) -> mi.Complex2f:
         """Return n + ik of the first medium at wavelengths in vacuum, nm."""
-        return self.at(self.position(wavelength))
+        return self.index_at(self.position(wavelength))
 
 
 def nodes_of(*media: RefractiveIndex) -> np.ndarray:

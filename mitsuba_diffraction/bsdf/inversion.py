@@ -145,20 +145,20 @@ class AliasTable:
         low, high = np.zeros(len(p), np.int64), (p <= 1).sum(axis=1)
         lows, last = high.copy(), self.count - 1
 
-        def at(position: NDArray[np.int64]) -> NDArray[np.int64]:
+        def entry(position: NDArray[np.int64]) -> NDArray[np.int64]:
             return np.asarray(order[of_each, np.minimum(position, last)])
 
-        rest = p[of_each, at(high)]  # what is left of the one that fills up others
+        rest = p[of_each, entry(high)]  # what is left of the one that fills up others
         threshold, alias = np.ones_like(p), np.tile(np.arange(self.count), (len(p), 1))
         for _ in range(self.count):
             fills = (rest > 1) & (low < lows)
             ends = ~fills & (high < last)
             full, used, following = (
-                (of_each[fills], at(low)[fills]),
-                (of_each[ends], at(high)[ends]),
-                at(high + 1)[ends],
+                (of_each[fills], entry(low)[fills]),
+                (of_each[ends], entry(high)[ends]),
+                entry(high + 1)[ends],
             )
-            threshold[full], alias[full] = p[full], at(high)[fills]
+            threshold[full], alias[full] = p[full], entry(high)[fills]
             threshold[used], alias[used] = rest[ends], following
             rest[fills] += p[full] - 1
             rest[ends] += p[of_each[ends], following] - 1

@@ -157,14 +157,14 @@ class Layers:
         """Return n behind the smooth face relative to that before it, at each wavelength."""
         if self.coat is not None:
             return self.coat.etas(si)
-        return [self.interface.at(wavelength).eta for wavelength in si.wavelengths]
+        return [self.interface.at_wavelength(wavelength).eta for wavelength in si.wavelengths]
 
     def _face(self, si: mi.SurfaceInteraction3f) -> mi.UnpolarizedSpectrum:
         """Return F of the smooth face."""
         cos = dr.abs(mi.Frame3f.cos_theta(si.wi))
         return mi.UnpolarizedSpectrum([mi.fresnel(cos, eta)[0] for eta in self._face_indices(si)])
 
-    def evaluate(
+    def eval_pdf(
         self,
         ctx: mi.BSDFContext,
         si: mi.SurfaceInteraction3f,
@@ -172,7 +172,7 @@ class Layers:
         active: mi.Bool,
         wo_is_sample: bool = False,
     ) -> tuple[mi.Spectrum, mi.Float]:
-        """Evaluate f cos θ_o and the density, as `mi.BSDF.eval_pdf`; for `wo_is_sample` see `Grating.evaluate`."""
+        """Return f cos θ_o and the density, as `mi.BSDF.eval_pdf`; `wo_is_sample` as in `Grating.value_and_density`."""
         if left_out.get():
             return mi.Spectrum(0.0), mi.Float(0.0)
         cos_i, cos_o = mi.Frame3f.cos_theta(si.wi), mi.Frame3f.cos_theta(wo)
@@ -183,7 +183,7 @@ class Layers:
         value, pdf = mi.Spectrum(0.0), mi.Float(0.0)
         if requested.grating:
             p_transmission = self._transmission_probability(si, requested)
-            of_grating, pdf = self.grating.evaluate(si, wo, active, wo_is_sample, p_transmission)
+            of_grating, pdf = self.grating.value_and_density(si, wo, active, wo_is_sample, p_transmission)
             value = self.grating.mueller(of_grating, ctx, si, wo, active)
         if requested.base is not None and self.base is not None:
             transmittance = self.grating.transmittance(si, cos_i, active)
@@ -269,7 +269,7 @@ class Layers:
             bs.wo = dr.select(of_base, dr.select(base_sample.pdf > 0, base_sample.wo, 0), bs.wo)
             bs.sampled_type = dr.select(of_base, base_sample.sampled_type, bs.sampled_type)
             bs.sampled_component = dr.select(of_base, base_sample.sampled_component + 1, 0)
-        value, bs.pdf = self.evaluate(ctx, si, bs.wo, active, wo_is_sample=True)
+        value, bs.pdf = self.eval_pdf(ctx, si, bs.wo, active, wo_is_sample=True)
         valid = active & (bs.pdf > 0)
         # Neither the direction nor its density is differentiated by the parameters.
         result = dr.select(valid, value / dr.detach(dr.select(valid, bs.pdf, 1)), 0)

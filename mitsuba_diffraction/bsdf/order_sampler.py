@@ -139,7 +139,7 @@ class OrderSampler:
 
     def _at(self, furnace: Furnace, above: bool, wavelengths: NDArray[np.float64]) -> tuple[Furnace, float]:
         """Return the furnace at the wavelength of `wavelengths`, which are equal, and n of the medium of ω_i."""
-        at = furnace.at(float(wavelengths[0]), self.laterals)
+        at = furnace.at_wavelength(float(wavelengths[0]), self.laterals)
         return at, self.coat_index if above else 1 / (at.index or 1.0)
 
     def _nodes(self, slice_: float) -> tuple[NDArray[np.float64], NDArray[np.float64]]:

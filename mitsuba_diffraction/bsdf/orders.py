@@ -115,7 +115,7 @@ class SlicePower(_NodeTable):
         Args:
             row, column: of the first node, including the rim; clipped to the table, whose rim is zero.
             weights_x, weights_y: w_x,i and w_y,j.
-            at: returned by the method `at` for κ.
+            at: returned by the method `at_kappa`.
             active: mask.
         """
         rows, columns = self._window(row, column, len(weights_y), len(weights_x))
@@ -129,7 +129,7 @@ class SlicePower(_NodeTable):
             packet = dr.fma(weight, row_sum, packet)
         return dr.dot(packet, factors)
 
-    def at(self, kappa: mi.Float, small: tuple[mi.Float, mi.Bool]) -> tuple[mi.UInt32, mi.Vector3f | mi.Vector4f]:
+    def at_kappa(self, kappa: mi.Float, small: tuple[mi.Float, mi.Bool]) -> tuple[mi.UInt32, mi.Vector3f | mi.Vector4f]:
         """Return the index of node 0 at κ (rad/µm), and the factors of the components of a packet.
 
         `small` is from `Geometry.small`; κ₁ is at most half of the first interval.
@@ -175,7 +175,7 @@ class AmplitudePower(_NodeTable):
             packets[:, 0, 1::2] *= 2
             self.factors = PacketTable(packets)
 
-    def at(self, kappa: mi.Float, small: tuple[mi.Float, mi.Bool]) -> tuple[mi.Float, mi.Float]:
+    def at_kappa(self, kappa: mi.Float, small: tuple[mi.Float, mi.Bool]) -> tuple[mi.Float, mi.Float]:
         """Return κ, and the factor of the power: κ₁²/κ² where `small` applies and κ < κ₁; a series is exact there."""
         kappa_1, where = small
         where = where & (kappa < kappa_1)
@@ -312,8 +312,8 @@ class OrderSpectrum:
         along_x, along_y = self.axes
         return along_x.contains(along_x.first(q_x), q_x, scale) & along_y.contains(along_y.first(q_y), q_y, scale)
 
-    def evaluate(self, geometry: Geometry, incidence: Incidence, active: mi.Bool) -> tuple[mi.Float, mi.Float]:
-        """As `Scattering.evaluate`.
+    def power_and_density(self, geometry: Geometry, incidence: Incidence, active: mi.Bool) -> tuple[mi.Float, mi.Float]:
+        """As `Scattering.power_and_density`.
 
         For resolved orders, and for all orders of line gratings, K and G are computed per order, with the gain of its
         lobe (`Geometry.order_factor`). For other tiles they are computed once, from the two directions
@@ -349,7 +349,7 @@ class OrderSpectrum:
                 windows = [(0, 0, lobes_x, lobes_y, geometry.kappa(incidence.frequency), mi.Bool(False))]
         power = 0
         for x, y, of_x, of_y, kappa, negated in windows:
-            at = self.power.at(kappa, geometry.small())
+            at = self.power.at_kappa(kappa, geometry.small())
             column, row = (
                 axis.max_order + axis.rim + dr.select(negated, -m, m)
                 for axis, m in zip(self.axes, (m_x + x, m_y + y), strict=True)

@@ -101,17 +101,17 @@ class Scales:
         """The maximum scale, at least one: the spectrum must begin at a wavelength shorter by this factor."""
         return max(1.0, *(float(scale.values[-1]) for scale in self))
 
-    def at(self, si: mi.SurfaceInteraction3f, active: mi.Bool) -> tuple[mi.Float, mi.Float]:
+    def ratio_and_lateral(self, si: mi.SurfaceInteraction3f, active: mi.Bool) -> tuple[mi.Float, mi.Float]:
         """Return h/s and s at a point, h of the heights and s of lengths along the surface.
 
         Scaling lengths by s and heights by h is equivalent to scaling heights by h/s, at the wavelength λ/s and with
         lobes of the width s σ_q.
         """
-        height = larger(self.height.at(si, active), _MIN_HEIGHT_SCALE)
+        height = larger(self.height.value_at(si, active), _MIN_HEIGHT_SCALE)
         if self.lateral is None:
             return height, mi.Float(1.0)
         # Not the number itself: Dr.Jit cannot differentiate a branch in a virtual call that takes a member as it is.
-        lateral = larger(self.lateral.at(si, active), _MIN_LATERAL_SCALE)
+        lateral = larger(self.lateral.value_at(si, active), _MIN_LATERAL_SCALE)
         return height / lateral, lateral
 
     @property

@@ -122,8 +122,8 @@ class RigorousOrders:
             in_lobe = active & (dr.abs(offset) <= self.half_width) & (dr.abs(m) <= self.max_order)
             yield m, dr.square(offset) + dr.square(pair.q.y), in_lobe
 
-    def evaluate(self, geometry: Geometry, incidence: Incidence, active: mi.Bool) -> tuple[mi.Float, mi.Float]:
-        """As `Scattering.evaluate`, with the gain Γ of `Geometry.order_squares_and_gain`."""
+    def power_and_density(self, geometry: Geometry, incidence: Incidence, active: mi.Bool) -> tuple[mi.Float, mi.Float]:
+        """As `Scattering.power_and_density`, with the gain Γ of `Geometry.order_squares_and_gain`."""
         frequency = incidence.frequency
         # Under a coat, the table is for wavelengths inside of it.
         pair = self._pair(geometry.incident, geometry.outgoing, frequency, incidence.coat_index * frequency)

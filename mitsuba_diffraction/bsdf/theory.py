@@ -85,7 +85,7 @@ class Scattering(Protocol):
     def meets(self, q_x: mi.Float, q_y: mi.Float, scale: mi.Float) -> mi.Bool:
         """Return whether q (cycles/µm) lies in the lobe, scaled by `scale`, of an order; true where lobes overlap."""
 
-    def evaluate(self, geometry: Geometry, incidence: Incidence, active: mi.Bool) -> tuple[mi.Float, mi.Float]:
+    def power_and_density(self, geometry: Geometry, incidence: Incidence, active: mi.Bool) -> tuple[mi.Float, mi.Float]:
         """Return the power and the density of q, both in µm², for one wavelength of a pair of directions.
 
         The power is n_o² K G S |cos θ_o|, with the gain of lobes, or n_o² Σ_m η_m Γ N |cos θ_o| in rigorous theory.
@@ -138,10 +138,10 @@ class Theory(Protocol):
         return
 
     def coordinates(self, geometry: Geometry) -> tuple[Coordinates, Coordinates] | None:
-        """Return the coordinates of both directions in the table of E, for `evaluate` at all wavelengths; else None."""
+        """Return the coordinates of both directions in the table of E, for all wavelengths; None without E."""
         return None
 
-    def evaluate(
+    def power_and_density(
         self, geometry: Geometry, incidence: Incidence, pair: tuple[Coordinates, Coordinates] | None, active: mi.Bool
     ) -> tuple[mi.Float, mi.Float]:
         """Return f |cos θ_o| λ² without R, and the density of q, both in µm², for one wavelength.
@@ -294,10 +294,10 @@ class ScalarTheory(Theory):
         incident, outgoing = geometry.incident.inner(), geometry.outgoing.inner()
         return self.energy.coordinates(incident), self.energy.coordinates(outgoing)
 
-    def evaluate(
+    def power_and_density(
         self, geometry: Geometry, incidence: Incidence, pair: tuple[Coordinates, Coordinates] | None, active: mi.Bool
     ) -> tuple[mi.Float, mi.Float]:
-        power, density = self.scattering.evaluate(geometry, incidence, active)
+        power, density = self.scattering.power_and_density(geometry, incidence, active)
         if pair is not None and self.energy is not None:
             frequency = incidence.frequency * incidence.coat_index
             power *= self.energy.factor(pair, frequency, geometry.height_scale)
@@ -361,10 +361,10 @@ class RigorousTheory(Theory):
             )
         self.light = wavelengths
 
-    def evaluate(
+    def power_and_density(
         self, geometry: Geometry, incidence: Incidence, pair: tuple[Coordinates, Coordinates] | None, active: mi.Bool
     ) -> tuple[mi.Float, mi.Float]:
-        return self.scattering.evaluate(geometry, incidence, active)
+        return self.scattering.power_and_density(geometry, incidence, active)
 
     def reflectance(self, si: mi.SurfaceInteraction3f, geometry: Geometry, active: mi.Bool) -> mi.UnpolarizedSpectrum:
         return mi.UnpolarizedSpectrum(1.0)

@@ -292,7 +292,7 @@ class FilmedMaterial(Material):
         self, si: mi.SurfaceInteraction3f, cos: Cosines, active: mi.Bool, with_phase: bool
     ) -> list[tuple[list[Wave], mi.Float]]:
         """Return the waves of each wavelength and Re z_s/z_0; without their phase, total reflection has a real z_s."""
-        cosines, above, scale = mi.UnpolarizedSpectrum(cos), self.above(si), self.scale.at(si, active)
+        cosines, above, scale = mi.UnpolarizedSpectrum(cos), self.above(si), self.scale.value_at(si, active)
         is_real, indices = self.propagates and self.transparent and not with_phase, self.indices
         planes = [
             _Plane.of(dr.abs(cosine), *self._media(cosine, n_s), is_real)
@@ -303,7 +303,7 @@ class FilmedMaterial(Material):
         def crossed(thickness: mi.Float, faces: list[_Face], film: mi.UInt32 | None = None) -> list[_Face]:
             found = []
             for channel, (plane, face) in enumerate(zip(planes, faces, strict=True)):
-                n = indices.at(positions[channel], film) if positions else mi.Complex2f(indices, 0)
+                n = indices.index_at(positions[channel], film) if positions else mi.Complex2f(indices, 0)
                 depth = thickness / si.wavelengths[channel]
                 if self.coat is not None:
                     n, depth = n / above[channel], depth * above[channel]
@@ -320,7 +320,7 @@ class FilmedMaterial(Material):
 
         faces = [(plane.fields(), mi.Complex2f(1, 0)) for plane in planes]
         if len(self.films) == 1:
-            faces = crossed(self.thickness.at(si, active) * scale * nanometres, faces)
+            faces = crossed(self.thickness.value_at(si, active) * scale * nanometres, faces)
         elif dr.grad_enabled(self.thickness.value, scale, planes):
             # Dr.Jit cannot differentiate the loop in reverse mode.
             for step in range(len(self.films)):

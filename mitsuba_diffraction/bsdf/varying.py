@@ -64,7 +64,7 @@ class VaryingNumber:
         if not np.isfinite(self.values).all():
             raise RequestError(f"{self.name}: got values that are not finite, wanted numbers")
 
-    def at(self, si: mi.SurfaceInteraction3f, active: mi.Bool) -> mi.Float:
+    def value_at(self, si: mi.SurfaceInteraction3f, active: mi.Bool) -> mi.Float:
         """Evaluate the number at a point."""
         return self.value.eval_1(si, active) if self.varies else self.value
 

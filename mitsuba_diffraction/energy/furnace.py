@@ -89,7 +89,7 @@ class Furnace:
         lobe_scale: the factor of the widths of lobes of orders.
         stack: the dielectric with its films, if light is transmitted.
         side: 1 if ω is above the surface, −1 if below.
-        planes: R and T of its plane at one wavelength (`at`), one for each thickness. If empty, the surface is bare.
+        planes: R and T of its plane for each thickness, from `at_wavelength`. If empty, the surface is bare.
     """
 
     spectrum: PowerSpectrum = field(repr=False)
@@ -144,7 +144,9 @@ class Furnace:
         """Return the components for light from below, where the surface has the heights −h and S(−q; κ)."""
         return replace(self, index=None if self.index is None else 1 / self.index, q=-self.q, side=-self.side)
 
-    def at(self, wavelength: float, laterals: tuple[float, float] = (1.0, 1.0), step: float = 0.0) -> Furnace:
+    def at_wavelength(
+        self, wavelength: float, laterals: tuple[float, float] = (1.0, 1.0), step: float = 0.0
+    ) -> Furnace:
         """Return the components with the index and R and T of a plane at one wavelength, µm in the medium above.
 
         `laterals` are the bounds of the scale of lengths s, by which the wavelength is divided; for `step` see
@@ -351,7 +353,7 @@ class Furnace:
         last, scale = self.powers.shape[1] - 1, self.height_scale if scale is None else scale
         flat, start = self.powers.ravel(), component * (last + 1)
 
-        def at(kappa: Real | float) -> Real:
+        def power_at(kappa: Real | float) -> Real:
             x = np.minimum(kappa * (last / self.spectrum.max_kappa), last)
             interval = np.minimum(np.floor(x), last - 1)
             index = start + interval.astype(np.int64)
@@ -360,9 +362,9 @@ class Furnace:
 
         scaled = kappa * scale
         if not branch:
-            return at(scaled)
+            return power_at(scaled)
         first = self._min_kappa(scale)
-        power = small_kappa(scaled, first, at(scaled), at(first), at(2 * first)) * (kappa > 0)
+        power = small_kappa(scaled, first, power_at(scaled), power_at(first), power_at(2 * first)) * (kappa > 0)
         if scale != self.height_scale:
             of_terms, of_scale = (self._min_kappa(x) / max(x, 1e-9) for x in (self.height_scale, scale))
             power = power * (np.maximum(kappa, of_terms) / np.maximum(kappa, of_scale)) ** 2

@@ -322,7 +322,7 @@ def _bounds(
     def of_slice(slice_: NDArray[np.int64]) -> Real:
         bounds = []
         for side in sides:
-            furnace = side.at(wavelengths[slice_[0]], laterals, step)
+            furnace = side.at_wavelength(wavelengths[slice_[0]], laterals, step)
             length = wavelengths[slice_] * (1.0 if side.side > 0 else furnace.index or 1.0)
             bounds.append(furnace.bounds(omega[slice_], length, ratios))
         return np.concatenate(bounds, axis=1)

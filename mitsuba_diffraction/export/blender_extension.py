@@ -71,6 +71,6 @@ def _indices() -> bytes:
     stream = io.BytesIO()
     media = {name: MediumBelow.of(name) for name in _METALS}
     middle = (edges[1:] + edges[:-1]) / 2
-    indices: dict[str, Any] = {name: np.array([medium.at(w) for w in middle]) for name, medium in media.items()}
+    indices: dict[str, Any] = {name: np.array([medium.index_at(w) for w in middle]) for name, medium in media.items()}
     np.savez_compressed(stream, **indices)
     return stream.getvalue()

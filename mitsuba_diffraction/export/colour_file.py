@@ -62,7 +62,7 @@ def write_colours(
             arrays[field.name] = value.astype("<u4" if value.dtype == np.uint32 else "<f4")
         else:
             numbers[field.name] = value
-    index = viewed.below.at(0.55)
+    index = viewed.below.index_at(0.55)
     header: dict[str, Any] = {
         "format": MARK,
         "version": _VERSION,

@@ -84,7 +84,7 @@ class Viewed:
 
     def reflected(self, wavelength: float, cosine: Real) -> Real:
         """Return R at a cosine of θ_h."""
-        s, p = fresnel(np.minimum(cosine, 1.0), self.below.at(wavelength) / self.coat)
+        s, p = fresnel(np.minimum(cosine, 1.0), self.below.index_at(wavelength) / self.coat)
         return (s + p) / 2
 
     def integrated(self, u: Real, w: Real) -> Real:

@@ -70,7 +70,7 @@ class ExportedGrating:
         if self.theory not in THEORIES:
             raise RequestError(f"theory: got {self.theory!r}, wanted one of {', '.join(THEORIES)}")
         self.below.check_theory(self.theory)
-        self.below.at(self.shortest)
+        self.below.index_at(self.shortest)
 
     @classmethod
     def of_surface(cls, requested: RequestedSurface, shortest: float) -> ExportedGrating:

@@ -63,7 +63,7 @@ def write_lswm(
             if from_below and not grating.transmits:
                 break
             wavelength = float(wavelengths[w]) * 1e-3
-            index = grating.below.at(wavelength)
+            index = grating.below.index_at(wavelength)
             light = IncidentLight(float(angles[a]), float(azimuths[b]), wavelength, index, from_below)
             for (key, _), side in zip(_SIDES, grating.diffracted(light), strict=False):
                 for order, matrix in zip((-side.m).tolist(), _amplitudes(side), strict=True):
@@ -78,7 +78,7 @@ def write_lswm(
             "lossless": grating.transmits,
         }
     x, y = (2 * np.pi / (length * 1e-6) for length in grating.period)
-    middle = grating.below.at(float(np.median(wavelengths)) * 1e-3)
+    middle = grating.below.index_at(float(np.median(wavelengths)) * 1e-3)
     content = {
         "description": f"{MARK}: {grating.description}",
         "n_lower": middle.real if np.isfinite(middle.real) else 1.0,

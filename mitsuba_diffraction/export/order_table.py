@@ -74,7 +74,7 @@ def write_order_table(
         for step, (w, b, a) in enumerate(np.ndindex(shape), 1):
             wavelength = float(wavelengths[w]) * 1e-3
             angle = float(incidence[a, w])
-            light = IncidentLight(angle, float(azimuths[b]), wavelength, grating.below.at(wavelength))
+            light = IncidentLight(angle, float(azimuths[b]), wavelength, grating.below.index_at(wavelength))
             of_light = [f"{number:.9g}" for number in (wavelengths[w], angle, azimuths[b])]
             for side in grating.diffracted(light):
                 for row in _rows(side):

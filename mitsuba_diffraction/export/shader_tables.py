@@ -98,7 +98,7 @@ class ShaderTables:
         """
         what = " ".join(description(spectrum.source, Media(below), 0.0).split())
         edges, colours = bins_of_wavelengths()
-        index = np.array([below.at(w) for w in (edges[1:] + edges[:-1]) / 2], np.complex128)
+        index = np.array([below.index_at(w) for w in (edges[1:] + edges[:-1]) / 2], np.complex128)
         index = np.where(np.isinf(index), 0, index)
         max_kappa = min(_MAX_HEIGHT_SCALE * 4e3 * np.pi / SHORTEST_DRAWN, spectrum.max_kappa)
         q = np.stack(np.meshgrid(*spectrum.grid.frequencies()), -1)
@@ -158,13 +158,13 @@ def bins_of_wavelengths() -> tuple[Real, Real]:
 def _sliced(spectrum: GratingSpectrum, max_kappa: float, of_nodes: Callable[[Real], Real], error: float) -> Real:
     """Return powers at equally spaced κ from 0 to `max_kappa`, (n, K), which are linear between them up to `error`."""
 
-    def at(count: int) -> Real:
+    def slices(count: int) -> Real:
         return np.stack(
             [of_nodes(np.maximum(spectrum.powers(k), 0)) for k in np.linspace(0, max_kappa, count)], axis=-1
         )
 
     for count in _SLICES:
-        fine = at(2 * count - 1)
+        fine = slices(2 * count - 1)
         between = (fine[:, :-1:2] + fine[:, 2::2]) / 2
         if np.abs(between - fine[:, 1::2]).sum(axis=0).max() < error * fine.sum(axis=0).max():
             break

@@ -269,7 +269,7 @@ def order_efficiencies(
     found: dict[tuple[int, ...], Real] = {}
     for step, (a, w) in enumerate(np.ndindex(incidence.shape), 1):
         wavelength = float(wavelengths[w]) * 1e-3
-        orders = solve(IncidentLight(float(incidence[a, w]), azimuth, wavelength, below.at(wavelength)))
+        orders = solve(IncidentLight(float(incidence[a, w]), azimuth, wavelength, below.index_at(wavelength)))
         for m, *pair in zip(orders.m, orders.s, orders.p, strict=True):
             of_order = found.setdefault(tuple(np.atleast_1d(m).tolist()), np.zeros((*incidence.shape, 2)))
             of_order[a, w] = pair

@@ -108,7 +108,7 @@ def efficiencies_of_peaks(
     for step, (a, w) in enumerate(np.ndindex(values.shape[1:3]), 1):
         wavelength, direction = float(wavelengths[w]) * 1e-3, incident_direction(float(angles[a]), azimuth)[:2]
         power, cos_half = _reflected(spectrum, direction, wavelength)
-        index, albedo = below.at(wavelength), max(1.0, power.sum())
+        index, albedo = below.index_at(wavelength), max(1.0, power.sum())
         polarised = np.stack(fresnel(cos_half, index)) * power
         for k, (region, centre) in enumerate(zip(regions, centres, strict=True)):
             other = _reflected(spectrum, -direction - wavelength * centre, wavelength)[0].sum()
@@ -132,7 +132,7 @@ def check_request(
     wanted = f"nm from {low:g} to {high:g}, for which the spectrum is valid"
     wavelengths = checked_numbers("wavelengths", wavelengths, wanted, low - 1e-3, high + 1e-3)
     for wavelength in wavelengths:
-        below.at(wavelength * 1e-3)
+        below.index_at(wavelength * 1e-3)
     return checked_numbers("angles", angles, "degrees above −90 and below 90", -90.0, 90.0), wavelengths
 
 

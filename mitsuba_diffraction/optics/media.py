@@ -68,7 +68,7 @@ class MediumBelow:
         """Where its index is known."""
         return () if self.index is None else (self.index.known(self.parameter),)
 
-    def at(self, wavelength: float) -> complex:
+    def index_at(self, wavelength: float) -> complex:
         """Return n + ik at a wavelength in vacuum, µm; infinite of the perfect mirror.
 
         Raises:

@@ -242,7 +242,7 @@ class LightOfBands:
             self._prepared = integrator, *integrator.parts(scene, sensor)
         return self._prepared[1:]
 
-    def of(self, rows: Rows, light: LightPaths, spp: int, seed: int, margin: int) -> NDArray[np.float32]:
+    def splats_of(self, rows: Rows, light: LightPaths, spp: int, seed: int, margin: int) -> NDArray[np.float32]:
         """Return the contributions to some rows of a pass, and to `margin` rows above and below."""
         if self._traced != (spp, seed):
             self.__del__()
@@ -291,7 +291,7 @@ def _trace(
         if light is not None:
             # What Dr.Jit keeps of the last pass is larger than the contributions, which are in other memory.
             dr.flush_malloc_cache()
-            splats = light_of_bands.of(rows, light, spp, seed, radius)
+            splats = light_of_bands.splats_of(rows, light, spp, seed, radius)
             sums = _sums_of_light(film, splats, first, spp, shape, margins)
     seed = pass_seed(seed, first) if first else seed
     sampler.set_samples_per_wavefront(spp)

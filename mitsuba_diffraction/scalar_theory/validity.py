@@ -317,7 +317,7 @@ def _solved(
         return None
     reflected = transmitted = 0.0
     if waves.depth > 0:
-        row, indices = tuple(height_field.heights[0].tolist()), tuple(below.at(length) for length in wavelengths)
+        row, indices = tuple(height_field.heights[0].tolist()), tuple(below.index_at(length) for length in wavelengths)
         reflected, transmitted = _solved_error(row, height_field.pixel_size, wavelengths, ERROR_ANGLES, indices)
     if not np.isfinite(reflected):
         return None

@@ -89,10 +89,10 @@ class Shaded:
     scale: mi.Float
     light: int | None = None
 
-    def evaluate(
+    def eval_pdf(
         self, ctx: mi.BSDFContext, si: mi.SurfaceInteraction3f, wo: mi.Vector3f, active: mi.Bool
     ) -> tuple[mi.Spectrum, mi.Float]:
-        """Evaluate as `Layers.evaluate`, without density; ω_i is the direction to the viewer, ω_o to the light."""
+        """Return what `Layers.eval_pdf` does, without density; ω_i is the direction to the viewer, ω_o to the light."""
         value, weight = mi.UnpolarizedSpectrum(0), mi.Float(1)
         grating, base = self.layers.grating, self.layers.base
         active = active & (mi.Frame3f.cos_theta(si.wi) > 0) & (mi.Frame3f.cos_theta(wo) > 0)
@@ -110,7 +110,7 @@ class Shaded:
                 rotated(si.wi, *frame),
                 self.weights[self.light],
                 active,
-                grating.scales.height.at(si, active),
+                grating.scales.height.value_at(si, active),
             )
             for channel in range(3):
                 value[channel] += weight * self.scale * rgb[channel]

@@ -130,7 +130,7 @@ class Canvas:
         field = np.fft.irfft2(np.fft.rfft2(rng.standard_normal((rows, columns))) * filter_, s=(rows, columns))
         return field / field.std()
 
-    def at(self, field: Real, x: float, y: float) -> float:
+    def value_at(self, field: Real, x: float, y: float) -> float:
         """Return the value of a field at a position, µm, wrapped."""
         rows, columns = field.shape
         return field[int(y / self.pixel[1]) % rows, int(x / self.pixel[0]) % columns]

@@ -41,8 +41,8 @@ def elaphe_synthetic(
     granules = np.zeros_like(canvas.heights)
     for x, row_shift in zip(canvas.centres(0), rng.normal(0, 0.05 * pitch, canvas.count[0]), strict=True):
         for y in canvas.centres(1):
-            x_0 = x + canvas.at(drift_x, x, y) + rng.normal(0, 0.04 * row_pitch)
-            y_0 = y + canvas.at(drift_y, x, y) + row_shift + rng.normal(0, 0.035 * pitch)
+            x_0 = x + canvas.value_at(drift_x, x, y) + rng.normal(0, 0.04 * row_pitch)
+            y_0 = y + canvas.value_at(drift_y, x, y) + row_shift + rng.normal(0, 0.035 * pitch)
             _elaphe_groove(canvas, rng, x_0, y_0)
             _elaphe_tip(canvas, rng, x_0, y_0 + pitch / 2)
             _elaphe_granules(canvas, granules, rng, x_0, y_0 + pitch / 2)
@@ -146,7 +146,7 @@ def xenopeltis_synthetic(
             if not _present(faults, own, x, y, canvas):
                 continue
             x_0 = x + _fault_shift(faults, x, y, canvas)
-            x_0 += canvas.at(meander, x_0, y)
+            x_0 += canvas.value_at(meander, x_0, y)
             fingers.append((x_0, y, row_pitch * (1 + rng.normal(0, 0.05))))
     for x_0, y_0, length in fingers:
         _xenopeltis_finger(canvas, rng, x_0, y_0, length)

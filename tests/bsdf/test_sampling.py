@@ -84,7 +84,7 @@ def incidence_of(omega, wavelength):
     """Return light incident from ω that is reflected; λ in µm."""
     interface = Interface()
     k_i = interface.wave_vector(vectors(omega))
-    return Incidence.of(k_i, interface.scattered(k_i, mi.Bool(True)), interface).at(floats(wavelength))
+    return Incidence.of(k_i, interface.scattered(k_i, mi.Bool(True)), interface).at_wavelength(floats(wavelength))
 
 
 def sampled(bsdf, wi, wavelengths, count, seed=0):

@@ -227,7 +227,7 @@ def test_reflected_and_transmitted_orders_are_drawn_with_their_probabilities(pro
     )
     k_i = interface.wave_vector(vectors(towards(theta, 20, 1 if above else -1)))
     k_o = interface.scattered(k_i, mi.Bool(reflects))
-    incidence = Incidence.of(k_i, k_o, interface).at(mi.Float(WAVELENGTH))
+    incidence = Incidence.of(k_i, k_o, interface).at_wavelength(mi.Float(WAVELENGTH))
     m_x, m_y = np.meshgrid(*spectrum.grid.axes())
     share = np.array(
         table.probability(mi.Int32(m_x.ravel()), mi.Int32(m_y.ravel()), incidence, mi.Bool(True)), np.float64
@@ -474,7 +474,8 @@ def test_large_smooth_facets_are_those_of_roughdielectric(theta, side):
     material = mi.Float(ETA)
     interface = Interface(eta=material, kappas=(mi.Float(1e-6), mi.Float(1e-6)))
     pair = Geometry.of(*(interface.wave_vector(vectors(omega)) for omega in (wi, wo)), interface)
-    incidence = Incidence.of(pair.incident, pair.outgoing, interface, kappa_sign=pair.kappa_sign).at(mi.Float(0.5))
+    incidence = Incidence.of(pair.incident, pair.outgoing, interface, kappa_sign=pair.kappa_sign)
+    incidence = incidence.at_wavelength(mi.Float(0.5))
     factor = pair.order_factor(pair.tangent, incidence, mi.Float(2e6)) * (1 - mi.fresnel(pair.cos_half(), material)[0])
     density = np.exp(-(slope**2).sum(-1) / alpha**2) / (np.pi * alpha**2)
     np.testing.assert_allclose(np.array(factor / dr.square(pair.v_z)) * density, wanted, rtol=5e-3)

@@ -43,8 +43,8 @@ def test_a_block_that_differs_is_found():
     brighter = pictures(0)
     brighter[:, 3:6, 9:, 1] *= 1.5
     found = PictureDifference.of(brighter, pictures(1))
-    assert (found.is_noise, found.at) == (False, (1, 3, 1))
-    assert found.relative[found.at] == pytest.approx(0.5, abs=0.1)
+    assert (found.is_noise, found.position) == (False, (1, 3, 1))
+    assert found.relative[found.position] == pytest.approx(0.5, abs=0.1)
     assert str(found).startswith("a difference beyond noise: +")
 
 

@@ -49,14 +49,14 @@ def _peaks(bsdf: object, wi: Real, wavelength: float, width: float) -> list[Real
     A centre is the mean of (u, v) weighted by f/(K G), which removes the variation of K G over a lobe.
     """
 
-    def evaluate(u: Real, v: Real) -> Real:
+    def brdf_at(u: Real, v: Real) -> Real:
         return density(bsdf, wi, np.stack([u, v, np.sqrt(1 - u**2 - v**2)], axis=-1), wavelength)
 
     axis = np.arange(-1, 1, 2 * width)
     u, v = (grid.ravel() for grid in np.meshgrid(axis, axis))
     inside = np.hypot(u, v) < np.sin(np.deg2rad(70))
     u, v = u[inside], v[inside]
-    values = evaluate(u, v)
+    values = brdf_at(u, v)
     candidates = np.flatnonzero(values > 0.02 * values.max())
     peaks = []
     offset = np.linspace(-8, 8, 81) * width
@@ -65,7 +65,7 @@ def _peaks(bsdf: object, wi: Real, wavelength: float, width: float) -> list[Real
         near = np.hypot(u[candidates] - u[strongest], v[candidates] - v[strongest]) < 12 * width
         candidates = candidates[~near]
         x, y = (axis.ravel() for axis in np.meshgrid(u[strongest] + offset, v[strongest] + offset))
-        weights = evaluate(x, y)
+        weights = brdf_at(x, y)
         peaks.append(np.array([x @ weights, y @ weights]) / weights.sum())
     return peaks
 

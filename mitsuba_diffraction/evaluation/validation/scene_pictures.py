@@ -72,7 +72,7 @@ class PictureDifference:
         return cls(ratio, float(np.hypot(total[1], of_total[1]) / scale), deviations, change / scale)
 
     @property
-    def at(self) -> tuple[int, int, int]:
+    def position(self) -> tuple[int, int, int]:
         """Row and column of the block, and channel, of the largest deviation; NaN counts as the largest."""
         size = np.where(np.isnan(self.deviations), np.inf, np.abs(self.deviations))
         row, column, channel = np.unravel_index(np.argmax(size), size.shape)
@@ -81,7 +81,7 @@ class PictureDifference:
     @property
     def deviation(self) -> float:
         """The largest deviation, in standard errors."""
-        return float(self.deviations[self.at])
+        return float(self.deviations[self.position])
 
     @property
     def is_noise(self) -> bool:
@@ -144,7 +144,7 @@ class SceneComparison:
 
     @property
     def _largest(self) -> str:
-        relative = 100 * self.difference.relative[self.difference.at]
+        relative = 100 * self.difference.relative[self.difference.position]
         return f"{relative:+.2g} % of the mean, {self.difference.deviation:+.1f} standard errors, in {self.where}"
 
     def __str__(self) -> str:
@@ -222,7 +222,7 @@ def _in_bands(picture: NDArray[np.float64]) -> NDArray[np.float64]:
 
 def _where(difference: PictureDifference, shape: tuple[int, ...], scene: mi.Scene) -> str:
     """Return the pixels and wavelengths of the largest deviation, in words."""
-    row, column, band = difference.at
+    row, column, band = difference.position
     rows, columns = (
         np.array_split(np.arange(size), count)[k]
         for size, count, k in zip(shape, difference.deviations.shape, (row, column), strict=False)
