@@ -5,6 +5,8 @@ from __future__ import annotations
 import functools
 import inspect
 import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated
 
@@ -23,7 +25,7 @@ from ..inverse_design.search import WHITE
 from ..inverse_design.target import finest_strokes
 from ..precomputation.surface_text import converted
 from ..progress import bytes_text, progress_bar, say, show, table, takes_long, tell, time_text
-from .arguments import Overwrite, check_suffix, named_as_options, parse_numbers
+from .arguments import Overwrite, as_command, check_suffix, named_as_options, parse_numbers
 from .render import Stopped
 
 _MIN_SAID_MEMORY = 1e9  # bytes
@@ -33,135 +35,183 @@ _OPTIONS = {name: f"--{name.replace('_', '-')}" for name in ("detail", "export",
 _OPTIONS["wavelengths"] = "--wavelength"
 
 
-def design(
-    target: Annotated[Path, typer.Argument(metavar="TARGET.png", help="the picture to cast, grey or RGB")],
+@dataclass(frozen=True)
+class DesignRequest:
+    """What `design` was asked for: its arguments and options."""
+
+    target: Annotated[Path, typer.Argument(metavar="TARGET.png", help="the picture to cast, grey or RGB")]
     output: Annotated[
         Path | None, typer.Option("-o", "--output", help="relief (.gsf, .tif); default: ./TARGET_relief.gsf")
-    ] = None,
-    texel: Annotated[float, typer.Option(help="side of a texel, µm")] = 0.8,
-    texels: Annotated[int | None, typer.Option(help="texels along the period; default: 32 to 96, by --detail")] = None,
+    ] = None
+    texel: Annotated[float, typer.Option(help="side of a texel, µm")] = 0.8
+    texels: Annotated[int | None, typer.Option(help="texels along the period; default: 32 to 96, by --detail")] = None
     detail: Annotated[
         float | None,
         typer.Option(
             help="number of its finest strokes along an edge of the picture, by default as measured in it; sets "
             "--texels, and --angle if need be"
         ),
-    ] = None,
+    ] = None
     height_range: Annotated[
         float | None,
         typer.Option(help="largest difference of heights, µm; default: 0.8, or more for fine strokes in white light"),
-    ] = None,
+    ] = None
     angle: Annotated[
         float, typer.Option(help="degrees from the mirror direction to the middle of an edge of the picture")
-    ] = 17.5,
+    ] = 17.5
     wavelength: Annotated[
         str | None, typer.Option(help="nm: one of a laser, several (450,550) or first:last:step; default: white light")
-    ] = None,
+    ] = None
     int_ior: Annotated[
         str | None,
         typer.Option(help="index of a sheet that transmits the light: a number, a name such as PMMA, or a file"),
-    ] = None,
+    ] = None
     seen_on: Annotated[
         str, typer.Option(help="wall (seen from the side of the plate) or screen (translucent, from the other side)")
-    ] = "wall",
-    invert: Annotated[bool, typer.Option("--invert", help="cast what is dark in the picture")] = False,
+    ] = "wall"
+    invert: Annotated[bool, typer.Option("--invert", help="cast what is dark in the picture")] = False
     unused: Annotated[
         str,
         typer.Option(help="where light goes that the colours cannot use: outside (of the frame), or mirror (order 0)"),
-    ] = "outside",
-    levels: Annotated[int | None, typer.Option(help="number of equidistant heights; default: continuous")] = None,
-    tool_blur: Annotated[float, typer.Option(help="standard deviation of the tool's blur, µm")] = 0.13,
+    ] = "outside"
+    levels: Annotated[int | None, typer.Option(help="number of equidistant heights; default: continuous")] = None
+    tool_blur: Annotated[float, typer.Option(help="standard deviation of the tool's blur, µm")] = 0.13
     export: Annotated[
         list[str] | None, typer.Option(help="also write: stl, gds (of --levels) or master (of a mould); repeatable")
-    ] = None,
+    ] = None
     starts: Annotated[
         int | None,
         typer.Option(help="random reliefs, of which the best is continued; default: 24, fewer of many texels"),
-    ] = None,
-    seed: Annotated[int, typer.Option(help="of the random reliefs")] = 0,
-    overwrite: Overwrite = False,
-) -> None:
+    ] = None
+    seed: Annotated[int, typer.Option(help="of the random reliefs")] = 0
+    overwrite: Overwrite = False
+
+    def outputs(self) -> tuple[Path, dict[str, Path]]:
+        """Return the paths of the relief and of the exports, which may be written.
+
+        Raises:
+            RequestError: if one of them may not.
+        """
+        stem = f"{self.target.stem}_relief"
+        default = free_name(stem, lambda stem: [Path(stem + suffix) for suffix in SUFFIXES], [self.target])
+        path = self.output or Path(f"{default}.gsf")
+        check_suffix("-o", path, ".gsf", ".tif")
+        with named_as_options(_OPTIONS):
+            exports = makers.export_paths(self.export or [], path)
+            if "gds" in exports:
+                makers.check_gds(self.levels)
+        outputs = [*(path.with_suffix(suffix) for suffix in SUFFIXES), *exports.values()]
+        named = [("-o" if output == path else f"-o {path}", output) for output in outputs]
+        check_outputs([self.target], named, overwrite=self.overwrite)
+        return path, exports
+
+    def check_light(self, picture: NDArray[np.float64]) -> None:
+        """Refuse a picture without light, and name `--invert` where it is dark on light."""
+        if picture.max() == 0:
+            help_ = "" if self.invert else "; --invert casts what is dark"
+            colour = "white" if self.invert else "black"
+            raise RequestError(f"{self.target}: got {colour} alone, wanted light somewhere{help_}")
+        if not self.invert and _is_dark_on_light(picture):
+            say(
+                "note", f"{self.target} is light up to its edges; --invert casts what is dark in it, with more contrast"
+            )
+
+    def wavelengths(self) -> list[float] | None:
+        """Return the wavelengths in nm, None for white light; check the numbers from which texels are computed."""
+        wavelengths = None if self.wavelength is None else parse_numbers("--wavelength", self.wavelength).tolist()
+        shortest = np.min(wavelengths or WHITE)
+        for option, value in (("--texel", self.texel), ("--angle", self.angle), ("--wavelength", shortest)):
+            if not (is_number(value) and value > 0):
+                raise RequestError(f"{option}: got {value:g}, wanted a positive number")
+        return wavelengths
+
+    def size(self, strokes: float, wavelengths: list[float] | None, index: float | str | None) -> _Size:
+        """Return the size of the plate for a picture of `strokes` along an edge, as far as it is not requested."""
+        light, depth, angle = wavelengths or WHITE, self.height_range, self.angle
+        if depth is None:
+            depth = depth_for_strokes(strokes if self.detail is None else self.detail, light, index)
+        if self.detail is not None:
+            if self.texels is not None:
+                raise RequestError(f"--detail: got {self.detail:g} and --texels {self.texels}, wanted one of them")
+            texels, angle = for_detail(self.detail, self.texel, angle, max(light))
+            why = f", angle {angle:g}°, for strokes of 1/{self.detail:g} of the picture"
+        elif self.texels is None:
+            per_texel = resolved_strokes(1, self.texel, angle, max(light))
+            fitting = math.ceil(max(_LEGIBLE * strokes, MIN_STROKES) / per_texel)
+            texels = min(max(fitting, _MIN_TEXELS), _MAX_TEXELS)
+            why = f"; the finest strokes are 1/{strokes:.0f} of the picture"
+        else:
+            return _Size(self.texels, depth, angle, "")
+        return _Size(texels, depth, angle, f"{texels} texels along the period, {depth:g} µm deep{why}")
+
+
+@dataclass(frozen=True)
+class _Size:
+    """Texels along the period, the height range in µm, the angle in degrees, and a note on what sets them."""
+
+    texels: int
+    height_range: float
+    angle: float
+    note: str
+
+
+@as_command(DesignRequest)
+def design(request: DesignRequest) -> None:
     """Compute the relief that casts a picture in white light, or in that of a laser."""
-    default = free_name(f"{target.stem}_relief", lambda stem: [Path(stem + suffix) for suffix in SUFFIXES], [target])
-    path = output or Path(f"{default}.gsf")
-    check_suffix("-o", path, ".gsf", ".tif")
-    picture = read_picture(target, invert=invert)
-    with named_as_options(_OPTIONS):
-        exports = makers.export_paths(export or [], path)
-        if "gds" in exports:
-            makers.check_gds(levels)
-    outputs = [path.with_suffix(suffix) for suffix in SUFFIXES]
-    outputs += exports.values()
-    named = [("-o" if output == path else f"-o {path}", output) for output in outputs]
-    check_outputs([target], named, overwrite=overwrite)
-    if picture.max() == 0:
-        help_ = "" if invert else "; --invert casts what is dark"
-        raise RequestError(f"{target}: got {'white' if invert else 'black'} alone, wanted light somewhere{help_}")
-    if not invert and _is_dark_on_light(picture):
-        say("note", f"{target} is light up to its edges; --invert casts what is dark in it, with more contrast")
-    wavelengths = None if wavelength is None else parse_numbers("--wavelength", wavelength).tolist()
-    # Before the number of texels is computed from them.
-    for option, value in (("--texel", texel), ("--angle", angle), ("--wavelength", np.min(wavelengths or WHITE))):
-        if not (is_number(value) and value > 0):
-            raise RequestError(f"{option}: got {value:g}, wanted a positive number")
-    options = _OPTIONS | {"target": str(target)}
-    strokes, longest, note = finest_strokes(picture), max(wavelengths or WHITE), ""
-    index = None if int_ior is None else converted(int_ior)
-    if height_range is None:
-        with named_as_options(options):
-            height_range = depth_for_strokes(strokes if detail is None else detail, wavelengths or WHITE, index)
-    if detail is not None:
-        if texels is not None:
-            raise RequestError(f"--detail: got {detail:g} and --texels {texels}, wanted one of them")
-        with named_as_options(options):
-            texels, angle = for_detail(detail, texel, angle, longest)
-        note = (
-            f"{texels} texels along the period, {height_range:g} µm deep, angle {angle:g}°, for strokes of "
-            f"1/{detail:g} of the picture"
-        )
-    elif texels is None:
-        fitting = math.ceil(max(_LEGIBLE * strokes, MIN_STROKES) / resolved_strokes(1, texel, angle, longest))
-        texels = min(max(fitting, _MIN_TEXELS), _MAX_TEXELS)
-        finest = f"the finest strokes are 1/{strokes:.0f} of the picture"
-        note = f"{texels} texels along the period, {height_range:g} µm deep; {finest}"
-    bar = progress_bar(f"design of {target.name}", "iterations")
-    with named_as_options(options), bar as progress:
-        found = search(
-            picture,
-            texel,
-            texels,
-            height_range,
-            angle,
-            wavelengths,
-            index,
-            levels,
-            seen_on=seen_on,
-            unused=unused,
-            tool_blur=tool_blur,
-            starts=starts if starts is not None else max(4, round(24 * (_MIN_TEXELS / max(texels, _MIN_TEXELS)) ** 2)),
-            seed=seed,
-            progress=progress,
-            expect=functools.partial(_say_effort, note),
-        )
+    picture = read_picture(request.target, invert=request.invert)
+    path, exports = request.outputs()
+    request.check_light(picture)
+    wavelengths, strokes = request.wavelengths(), finest_strokes(picture)
+    index = None if request.int_ior is None else converted(request.int_ior)
+    bar = progress_bar(f"design of {request.target.name}", "iterations")
+    with named_as_options(_OPTIONS | {"target": str(request.target)}):
+        size = request.size(strokes, wavelengths, index)
+        fewer = (_MIN_TEXELS / max(size.texels, _MIN_TEXELS)) ** 2
+        with bar as progress:
+            found = search(
+                picture,
+                request.texel,
+                size.texels,
+                size.height_range,
+                size.angle,
+                wavelengths,
+                index,
+                request.levels,
+                seen_on=request.seen_on,
+                unused=request.unused,
+                tool_blur=request.tool_blur,
+                starts=request.starts if request.starts is not None else max(4, round(24 * fewer)),
+                seed=request.seed,
+                progress=progress,
+                expect=functools.partial(_say_effort, size.note),
+            )
     paths = save(found, path)
     makers.export(found, exports)
     _report(found)
+    _report_files(found, paths, exports)
+    _report_verdict(found, strokes, request.invert)
+    if found.interrupted:
+        raise Stopped(f"{paths[0]} holds the best relief so far")
+
+
+def _report_files(found: Design, paths: Sequence[Path], exports: Mapping[str, Path]) -> None:
     relief, tiff, recipe, figure = paths
     field = found.height_field
     tell(
         f"{relief}: one period, {field.tile_size[0]:.4g} × {field.tile_size[1]:.4g} µm\n{tiff}: the same, pixels of "
-        f"{field.pixel_size[0] * 1e3:.4g} nm, {height_range:g} µm from black to white; its top row is at the lowest "
-        f"y\n{recipe}: its recipe, for scenes\n{figure}: target, prediction and relief"
+        f"{field.pixel_size[0] * 1e3:.4g} nm, {found.plate.height_range:g} µm from black to white; its top row is at "
+        f"the lowest y\n{recipe}: its recipe, for scenes\n{figure}: target, prediction and relief"
     )
     for name, file in exports.items():
         tell(f"{file}: {makers.EXPORTS[name][1]}")
-    verdict = Verdict.of(found, strokes, inverted=invert, names=_OPTIONS | {"negative": "--invert"})
+
+
+def _report_verdict(found: Design, strokes: float, inverted: bool) -> None:
+    verdict = Verdict.of(found, strokes, inverted=inverted, names=_OPTIONS | {"negative": "--invert"})
     for warning in filter(None, [found.warning, "" if verdict.grade == "good" else str(verdict)]):
         tell(f"! {warning}")
     if verdict.grade == "good":
         tell(str(verdict))
-    if found.interrupted:
-        raise Stopped(f"{relief} holds the best relief so far")
 
 
 def _say_effort(chosen: str, seconds: float, memory: float) -> None:

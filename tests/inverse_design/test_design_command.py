@@ -9,7 +9,6 @@ import pytest
 from PIL import Image
 
 import mitsuba_diffraction as md
-from mitsuba_diffraction import cli
 from mitsuba_diffraction.errors import RequestError
 from mitsuba_diffraction.files.outputs import check_outputs
 from mitsuba_diffraction.files.picture_file import read_picture
@@ -187,7 +186,7 @@ def test_an_interrupted_command_writes_the_best_so_far(command, monkeypatch, num
             if done == 40:
                 signal.raise_signal(number)
 
-    monkeypatch.setitem(cli.design.__globals__, "progress_bar", lambda *_: Bar())
+    monkeypatch.setattr(import_module("mitsuba_diffraction.cli.design"), "progress_bar", lambda *_: Bar())
     code, _, error = command(f"design flag.png {OPTIONS}")
     assert code == 130
     assert "flag_relief.gsf holds the best relief so far" in error
