@@ -90,8 +90,8 @@ def ruled(
         facet = float(np.deg2rad(blaze_angle))
         path = 2 * np.sin(facet) if blaze_ior is None else np.sin(np.arcsin(blaze_ior * np.sin(facet)) - facet)
         blaze_wavelength = float(1e3 * period * path)
-    used = "" if blaze_ior is None else f" in transmission, n = {blaze_ior:g}"
-    source = f"ruled grating, {lines_per_mm:g} lines/mm, blazed for {blaze_wavelength:.4g} nm{used}"
+    used = "reflection" if blaze_ior is None else f"transmission, n = {blaze_ior:g}"
+    source = f"ruled grating, {lines_per_mm:g} lines/mm, blazed for {blaze_wavelength:.4g} nm in {used}"
     depth = period * np.tan(facet)
     check_profile(period, depth, samples)
     return one_row(depth * phase(samples), period, f"{source} ({np.degrees(facet):.2f}°)")

@@ -61,7 +61,7 @@ def test_the_blaze_angle_stands_for_the_blaze_wavelength():
     # Richardson Gratings' catalogue: 600 lines/mm, 13.9°, 800 nm.
     by_angle = ruled(600, blaze_angle=13.9)
     np.testing.assert_allclose(by_angle.heights, ruled(600, blaze_wavelength=800.8).heights, atol=1e-4)
-    assert by_angle.source == "ruled grating, 600 lines/mm, blazed for 800.8 nm (13.90°)"
+    assert by_angle.source == "ruled grating, 600 lines/mm, blazed for 800.8 nm in reflection (13.90°)"
     angle = 17.178
     of_glass = ruled(300, blaze_angle=angle, blaze_ior=1.52), ruled(300, blaze_wavelength=550, blaze_ior=1.52)
     np.testing.assert_allclose(*(field.heights for field in of_glass), atol=1e-4)
