@@ -145,6 +145,29 @@ def test_later_frames_and_loads_have_the_kernels_of_the_first_frame():
     assert all(frame.keys() <= first.keys() for frame in later)
 
 
+def arrays_kept_by(value: object) -> list:
+    """The arrays of Dr.Jit that an object of the package holds, its members' included, but for those of plugins."""
+    if isinstance(value, mi.DiscreteDistribution):
+        return [value.pmf, value.cdf]
+    if isinstance(value, dict | list | tuple):
+        return [
+            array for item in (value.values() if isinstance(value, dict) else value) for array in arrays_kept_by(item)
+        ]
+    if type(value).__module__.startswith("mitsuba_diffraction") and not isinstance(value, mi.Object):
+        return arrays_kept_by(vars(value))
+    return [value] if dr.is_array_v(value) else []
+
+
+@pytest.mark.parametrize("sky", [{"type": "constant"}, {"type": "point", "position": [1, 0, 3]}])
+def test_what_is_made_once_for_a_scene_holds_no_literals(sky):
+    """Dr.Jit places a literal by the time at which it was made: in the kernel of a later frame it is elsewhere."""
+    built = scene(BLAZE, "diffraction_path", sky=sky)
+    eye, _ = built.integrator().parts(built, built.sensors()[0])
+    found = arrays_kept_by(eye.tracer)
+    assert len(found) > 10
+    assert not [array for array in found if array.state == dr.VarState.Literal]
+
+
 def test_bodies_of_loops_are_recorded_once(monkeypatch):
     """Recording is most of the time of a small picture, and was repeated up to eight times where loops are nested.
 

@@ -63,14 +63,13 @@ _LATTICE = (0.7548776662466927, 0.5698402909980532)
 class MetEmitters:
     """The emitters that rays meet, as `si.emitter(scene)` returns them.
 
-    The environment is an opaque number. Mitsuba's is a literal, which depends on the order in which threads load lamps:
-    the same scene would have several kernels.
+    The environment is an opaque number, zero where there is none. Mitsuba's is a literal, which depends on the order in
+    which threads load lamps: the same scene would have several kernels.
     """
 
     def __init__(self, scene: mi.Scene) -> None:
         self._environment = mi.EmitterPtr(scene.environment())
-        if scene.environment() is not None:
-            dr.make_opaque(self._environment)
+        dr.make_opaque(self._environment)
 
     def at(self, si: mi.SurfaceInteraction3f) -> mi.EmitterPtr:
         """Return the emitter that a ray meets."""
