@@ -1,6 +1,8 @@
 """The orders and nodes that are kept, the tables, and the evaluation of S from them."""
 
 import contextlib
+import dataclasses
+import itertools
 
 import numpy as np
 import pytest
@@ -355,3 +357,17 @@ def test_frequencies_that_are_not_finite_do_not_become_numbers(blaze, bad):
 def test_wavelengths_that_are_no_range_are_refused(wavelengths):
     with pytest.raises(ValueError, match="wavelengths: got"):
         md.precompute(md.HeightField([[0.0]], 0.05), wavelengths=wavelengths)
+
+
+def test_spectra_of_equal_tables_and_other_settings_have_other_digests():
+    """BSDFs of equal digests have tables and samplers in common; separate orders have equal tables for all lobes."""
+    heights = md.gratings.blazed(2.5, 0.25)
+
+    def built(heights, coherence_length, tolerance):
+        return md.precompute(heights, coherence_length=coherence_length, tolerance=tolerance)
+
+    spectra = [built(heights, *row) for row in itertools.product((60.0, 90.0), (1e-2, 5e-3))]
+    tables = {spectrum.table.values.tobytes() for spectrum in spectra}
+    assert len(tables) < len(spectra) == len({spectrum.digest for spectrum in spectra})
+    renamed = built(dataclasses.replace(heights, source="of another name"), 60.0, 1e-2)
+    assert renamed.digest == spectra[0].digest
