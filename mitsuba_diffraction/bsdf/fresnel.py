@@ -53,7 +53,7 @@ class Material:
         reflected = self(si, cos_half, active)
         return reflected, 1 - reflected
 
-    def known(self) -> tuple[KnownRange, ...]:
+    def known_ranges(self) -> tuple[KnownRange, ...]:
         """Return where each index of the material is known."""
         return ()
 
@@ -160,8 +160,8 @@ class Dielectric(Material):
             self.dispersion = Dispersion([medium], outside)
         self.update()
 
-    def known(self) -> tuple[KnownRange, ...]:
-        return (self.medium.known("int_ior", clear=True),)
+    def known_ranges(self) -> tuple[KnownRange, ...]:
+        return (self.medium.known_range("int_ior", clear=True),)
 
     def update(self) -> None:
         """Check the index and make it an opaque array: Dr.Jit would compile a literal into its kernels.
@@ -224,7 +224,7 @@ class SpectralConductor(Material):
         self._known = known_spectrum("eta", eta), known_spectrum("k", k)
         check_spectra(eta, k, *self._known)
 
-    def known(self) -> tuple[KnownRange, ...]:
+    def known_ranges(self) -> tuple[KnownRange, ...]:
         return self._known
 
     def __call__(self, si: mi.SurfaceInteraction3f, cos_half: Cosines, active: mi.Bool) -> mi.UnpolarizedSpectrum:
@@ -274,8 +274,8 @@ class Conductor(SpectralConductor):
         super().__init__(of_n, of_k, 1.0, coat)
         self.medium, self.outside = medium, outside
 
-    def known(self) -> tuple[KnownRange, ...]:
-        return (self.medium.known("material"),)
+    def known_ranges(self) -> tuple[KnownRange, ...]:
+        return (self.medium.known_range("material"),)
 
     def __repr__(self) -> str:
         return f"conductor, {self.medium}"

@@ -74,7 +74,7 @@ class Grating:
             RequestError: if an index or a saved spectrum does not cover them, or the coherence length is shorter.
         """
         self._check_window(wavelengths[1])
-        for index in self._request.known:
+        for index in self._request.known_ranges:
             index.check(wavelengths)
         before = self.theory.light or wavelengths
         wavelengths = min(wavelengths[0], before[0]), max(wavelengths[1], before[1])
@@ -110,7 +110,7 @@ class Grating:
 
     def _range(self) -> tuple[float, float]:
         """Return the shortest and the longest wavelength that the spectrum and all indices cover, nm."""
-        first, last = zip(*(index.wavelengths for index in self._request.known), strict=True)
+        first, last = zip(*(index.wavelengths for index in self._request.known_ranges), strict=True)
         shortest, longest = np.clip(self.theory.wavelengths, max(first), min(last))
         return float(shortest), float(longest)
 

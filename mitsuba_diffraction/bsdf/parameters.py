@@ -389,15 +389,15 @@ class GratingRequest:
     surface: Spectrum | Recipe
 
     @property
-    def known(self) -> tuple[KnownRange, ...]:
+    def known_ranges(self) -> tuple[KnownRange, ...]:
         """Where each index that the scene names is known."""
-        return *self.media.known, *self.material.known(), *self._known_of_recipe
+        return *self.media.known_ranges, *self.material.known_ranges(), *self._known_of_recipe
 
     @cached_property
     def _known_of_recipe(self) -> tuple[KnownRange, ...]:
         """Where the index of a rigorous recipe is known: once, as its file may be gone when a kernel is traced."""
         settings = self.surface.settings if isinstance(self.surface, Recipe) else None
-        return medium_below(settings).known if isinstance(settings, RigorousSettings) else ()
+        return medium_below(settings).known_ranges if isinstance(settings, RigorousSettings) else ()
 
     def widened(self, wavelengths: tuple[float, float], scale: float = 1.0) -> Recipe | None:
         """Return the recipe for light of these wavelengths in air, nm; None for one that sets its own, or a file.

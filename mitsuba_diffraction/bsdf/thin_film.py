@@ -241,8 +241,8 @@ class FilmedMaterial(Material):
     def eta(self) -> Any:  # type: ignore[override]
         return self.below.eta
 
-    def known(self) -> tuple[KnownRange, ...]:
-        return (*self.below.known(), *(film.known("thin_film_ior") for film in self.films))
+    def known_ranges(self) -> tuple[KnownRange, ...]:
+        return (*self.below.known_ranges(), *(film.known_range("thin_film_ior") for film in self.films))
 
     def update(self) -> None:
         self.below.update()

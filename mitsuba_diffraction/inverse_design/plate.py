@@ -113,7 +113,7 @@ class Plate:
             )
         if self.int_ior is not None:
             medium = index_of("int_ior", self.int_ior)
-            medium.known("int_ior").check((float(self.wavelengths.min()), float(self.wavelengths.max())))
+            medium.known_range("int_ior").check((float(self.wavelengths.min()), float(self.wavelengths.max())))
             n = medium(self.wavelengths * 1e-3)
             if n.imag.max() > MAX_CLEAR_K or not (1 < n.real.min() <= n.real.max() <= 10):
                 raise RequestError(f"int_ior: got {self.int_ior!r}, wanted an index above 1, or none for a mirror")

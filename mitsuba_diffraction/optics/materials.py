@@ -217,7 +217,7 @@ class RefractiveIndex:
             return 0.0, np.inf
         return float(self.wavelengths[0] * 1e3), float(self.wavelengths[-1] * 1e3)
 
-    def known(self, parameter: str, clear: bool = False) -> KnownRange:
+    def known_range(self, parameter: str, clear: bool = False) -> KnownRange:
         """Return where the index is known, for a parameter that names it; `clear`: taken as transparent there."""
         return KnownRange(parameter, self.name, self.range, self if clear else None, self.doubts)
 
@@ -290,7 +290,7 @@ def refractive_index(
     assert value is not None
     index = index_of(name, value)
     if known:
-        index.known(name).check((wavelength * 1e3, wavelength * 1e3))
+        index.known_range(name).check((wavelength * 1e3, wavelength * 1e3))
     return complex(index(wavelength))
 
 

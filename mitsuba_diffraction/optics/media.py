@@ -64,9 +64,9 @@ class MediumBelow:
         return self.index is not None and not self.index.absorbs
 
     @property
-    def known(self) -> tuple[KnownRange, ...]:
+    def known_ranges(self) -> tuple[KnownRange, ...]:
         """Where its index is known."""
-        return () if self.index is None else (self.index.known(self.parameter),)
+        return () if self.index is None else (self.index.known_range(self.parameter),)
 
     def index_at(self, wavelength: float) -> complex:
         """Return n + ik at a wavelength in vacuum, µm; infinite of the perfect mirror.
@@ -76,7 +76,7 @@ class MediumBelow:
         """
         if self.index is None:
             return complex("inf")
-        for known in self.known:
+        for known in self.known_ranges:
             known.check((wavelength * 1e3, wavelength * 1e3))
         return complex(self.index(wavelength))
 
@@ -173,10 +173,10 @@ class Media:
         return self.below.parameter if self.transmits and self.eta > 1 else "ext_ior"
 
     @property
-    def known(self) -> tuple[KnownRange, ...]:
+    def known_ranges(self) -> tuple[KnownRange, ...]:
         """Where the indices of the medium above and of the coat are known."""
-        coats = () if self.coat is None else (self.coat.known("coat_ior", clear=True),)
-        return self.above.known("ext_ior", clear=True), *coats
+        coats = () if self.coat is None else (self.coat.known_range("coat_ior", clear=True),)
+        return self.above.known_range("ext_ior", clear=True), *coats
 
     def with_eta(self, eta: float) -> Media:
         """Return the media with another relative index below, without dispersion."""

@@ -181,7 +181,7 @@ class Recipe:
         return sample
 
     @property
-    def known(self) -> tuple[str, ...]:
+    def value_names(self) -> tuple[str, ...]:
         """The names of the values that a recipe of such a surface may have, but for `scan` and `profile`."""
         is_scan = "scan" in self.surface
         own = SCAN_KEYS if is_scan else (*inspect.signature(PROFILES[self.surface["profile"]]).parameters, "patches")

@@ -106,7 +106,7 @@ class RequestedSurface:
             recipe = Recipe.load(self.path, **settings)
         else:
             recipe = Recipe({"scan": self.path.name}, Settings.of(**settings), self.path.parent)
-        known = recipe.known
+        known = recipe.value_names
         if unknown := [name for name in of_surface if name not in known]:
             names = (*known, *(name for name in self.names_aside if name not in known))
             wanted = f"wanted some of {', '.join(names)}{did_you_mean(unknown[0], names)}"

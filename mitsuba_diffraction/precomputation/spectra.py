@@ -132,7 +132,7 @@ def check_material(settings: Settings) -> None:
     below = rigorous.medium_below(settings)
     shortest, longest = (wavelength * settings.ext_ior for wavelength in settings.wavelengths)
     try:
-        for known in below.known:
+        for known in below.known_ranges:
             known.check((shortest, longest))
     except RequestError as error:
         if settings.ext_ior == 1:

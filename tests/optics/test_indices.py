@@ -218,7 +218,7 @@ def test_k_that_is_taken_as_zero_is_said_each_time(tmp_path, page, light, words)
     for _ in range(2):
         with warnings.catch_warnings(record=True) as caught:
             warnings.simplefilter("always")
-            index_of("material", path).known("material").check(light)
+            index_of("material", path).known_range("material").check(light)
         assert [str(one.message) for one in caught] == ([f"material: a.yml has {words}"] if words else [])
 
 
