@@ -21,6 +21,7 @@ from mkdocs.commands.build import build
 from mkdocs.config import load_config
 
 import mitsuba_diffraction as md
+from mitsuba_diffraction.energy import table
 from mitsuba_diffraction.shader_2014.quirks import Quirks
 
 ROOT = Path(__file__).parents[1]
@@ -161,6 +162,10 @@ def run_xml(text):
 def test_the_code_of_a_page_runs(page, folder, command, llvm, capfd, monkeypatch):
     if page.stem == "README":
         monkeypatch.setattr(md, "example_scene", partial(md.example_scene, size=16, **SMALL_DISC))
+        # Tables of E of few nodes, for this test alone.
+        monkeypatch.setattr(table, "MAX_NODE_COMPONENT_PAIRS", 3e5)
+        monkeypatch.setattr(table, "_kept", {})
+        monkeypatch.setenv("MITSUBA_DIFFRACTION_CACHE", str(folder / "cache"))
     names = {}
     parts = list(blocks(page))
     for (language, text), (following, shown) in zip(parts, [*parts, ("", "")][1:], strict=True):

@@ -43,7 +43,7 @@ SCENE = """<scene version="3.0.0">
     <shape type="rectangle"><transform name="to_world"><translate z=".1"/></transform>
         <bsdf type="diffraction_grating"><string name="profile" value="blazed"/><float name="period" value="2.5"/>
             <float name="depth" value="0.25"/><float name="coherence_length" value="6"/>
-            <string name="material" value="none"/></bsdf></shape>
+            <string name="material" value="none"/><boolean name="conserve_energy" value="false"/></bsdf></shape>
     <emitter type="directional"><vector name="direction" x="0" y=".6" z="-.8"/></emitter>
 </scene>"""
 
@@ -71,7 +71,7 @@ SCENE_WITH_ALPHA = """<scene version="3.0.0">
     <shape type="rectangle"><transform name="to_world"><scale value=".5"/><translate x=".1"/></transform>
         <bsdf type="diffraction_grating"><string name="profile" value="blazed"/><float name="period" value="2.5"/>
             <float name="depth" value="0.25"/><float name="coherence_length" value="6"/>
-            <string name="material" value="none"/></bsdf></shape>
+            <string name="material" value="none"/><boolean name="conserve_energy" value="false"/></bsdf></shape>
     <shape type="rectangle"><transform name="to_world"><scale value=".5"/><translate x="1.2"/></transform>
         <bsdf type="mask"><float name="opacity" value=".5"/><bsdf type="diffuse"/></bsdf></shape>
     LIGHT
