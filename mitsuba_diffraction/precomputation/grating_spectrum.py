@@ -102,9 +102,11 @@ class GratingSpectrum(PowerSpectrum):
         with stage("bound of the albedo"):
             table = EnergyTable.of(self)
         if self.cache is not None:
-            # Without its E it is a spectrum of the cache as well, whose E is computed again.
+            # Without E, an entry is as good: E is computed again.
             with suppress(RequestError, OSError, RuntimeError):
-                replace(self, energy=table).save(*self.cache)
+                entry = GratingSpectrum.load(*self.cache)
+                if entry.cache is not None and entry.digest == self.digest:  # not of a copy with another table
+                    replace(entry, energy=table).save(*self.cache)
         return table
 
     def up_to(self, longest: float) -> GratingSpectrum:

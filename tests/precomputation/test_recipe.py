@@ -385,6 +385,15 @@ def test_e_is_computed_for_a_bsdf_and_added_to_the_cache(own_cache, monkeypatch)
     assert len(computed) == 1
 
 
+def test_e_of_a_changed_copy_is_not_added_to_the_cache(own_cache):
+    recipe = Recipe(CROSSED, ScalarSettings(**FAST))
+    spectrum = recipe.cached()
+    entry = (own_cache / f"{recipe.digest()}.exr").read_bytes()
+    weaker = replace(spectrum.table, values=0.5 * spectrum.table.values)
+    assert replace(spectrum, table=weaker).energy_table().values.min() > 0
+    assert (own_cache / f"{recipe.digest()}.exr").read_bytes() == entry
+
+
 def test_e_is_computed_where_the_cache_has_gone(own_cache):
     spectrum = Recipe(CROSSED, ScalarSettings(**FAST)).cached()
     shutil.rmtree(own_cache)
