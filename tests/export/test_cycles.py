@@ -5,6 +5,7 @@ import os
 import re
 import subprocess
 import sys
+from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
@@ -179,53 +180,80 @@ def path_traced(bsdf, shape, light, spp):
     return np.array(mi.render(scene, spp=spp))
 
 
+@dataclass(frozen=True)
+class Beside:
+    """A surface in Cycles beside the path tracer: `regions` bright ones, their luminance and ΔE00."""
+
+    suffix: str
+    shape: str
+    surface: str
+    samples: int
+    regions: int
+    luminance: tuple[float, float]
+    max_delta_E: float
+    coat: float = 1.0
+
+    def __str__(self):
+        return f"{self.surface.partition(',')[0]}{'-coated' * (self.coat > 1)}{self.suffix}"
+
+
+SINUSOID = "sinusoidal,period=1.6,depth=0.15,coherence_length=30,material=Al"
+BLAZE = "blazed,period=1.9,depth=0.2,coherence_length=30,material=Al"
+DISC = "compact_disc,coherence_length=30,material=Al"
+FOIL = "foil,coherence_length=12,material=Al"
+# Nodes have no negative light, and so no colours outside of sRGB, which orders of both line gratings have: 3.9 and 7.6
+# from the nearest. In the other regions non-negative colours fitted to them alone still leave a ΔE00 of up to 4.4, and
+# those of the nodes are the same for all surfaces. Faint regions of foil and skin are a tenth darker by OSL as well.
+BESIDE = (
+    Beside(".osl", "plane", SINUSOID, 1200, 2, (0.93, 1.07), 5),
+    Beside(".osl", "disc", BLAZE, 1200, 2, (0.93, 1.07), 5),
+    Beside(".osl", "sphere", FOIL, 9000, 1, (0.9, 1.1), 5),
+    Beside(".npz", "plane", SINUSOID, 1200, 2, (0.96, 1.06), 6.5),
+    Beside(".npz", "disc", BLAZE, 3000, 3, (0.96, 1.12), 9),
+    Beside(".npz", "disc", DISC, 1500, 1, (0.95, 1.05), 3),
+    Beside(".npz", "disc", DISC, 1500, 1, (0.95, 1.05), 3, coat=1.55),
+    Beside(".npz", "sphere", FOIL, 3000, 2, (0.87, 1.07), 5.5),
+    Beside(".npz", "sphere", "xenopeltis_synthetic", 3000, 2, (0.84, 1.07), 7.5),
+)
+
+
 @pytest.mark.slow
 @needs_blender
-@pytest.mark.parametrize(
-    ("suffix", "shape", "profile", "coherence", "radius", "samples"),
-    [
-        (".osl", "plane", "sinusoidal,period=1.6,depth=0.15", 30, 0.15, 1200),
-        (".osl", "disc", "blazed,period=1.9,depth=0.2", 30, 0.15, 1200),
-        (".osl", "sphere", "foil", 12, 0.15, 9000),
-        (".npz", "plane", "sinusoidal,period=1.6,depth=0.15", 30, 0.15, 1200),
-    ],
-)
-def test_orders_in_cycles_are_those_of_the_path_tracer(
-    suffix, shape, profile, coherence, radius, samples, command, tmp_path, llvm
-):
-    shader = tmp_path / f"grating{suffix}"
-    code, _, error = command("export", f"{profile},coherence_length={coherence},material=Al", "-o", str(shader))
+@pytest.mark.parametrize("case", BESIDE, ids=str)
+def test_orders_in_cycles_are_those_of_the_path_tracer(case, command, tmp_path, llvm):
+    shader = tmp_path / f"grating{case.suffix}"
+    code, _, error = command("export", case.surface, "-o", str(shader))
     assert code == 0, error
-    name, *values = profile.split(",")
-    parameters = {key: float(value) for key, value in (value.split("=") for value in values)}
-    bsdf = {
-        "type": "diffraction_grating",
-        "profile": name,
-        "coherence_length": coherence,
-        "material": "Al",
-        **parameters,
-    }
-    if shape == "disc":
+    if case.coat > 1:
+        np.savez(shader, **np.load(shader), coat=case.coat)
+    name, *values = case.surface.split(",")
+    parameters = dict(value.split("=") for value in values)
+    bsdf = {key: value if key == "material" else float(value) for key, value in parameters.items()}
+    bsdf |= {"type": "diffraction_grating", "profile": name}
+    if case.coat > 1:
+        bsdf["coat_ior"] = case.coat
+    if case.shape == "disc":
         bsdf["orientation"] = "radial"
-    ours = path_traced(bsdf, shape, radius, 4096)
-    cycles = in_cycles(shader, shape, radius, samples, tmp_path)
+    ours = path_traced(bsdf, case.shape, 0.15, 1024)
+    cycles = in_cycles(shader, case.shape, 0.15, case.samples, tmp_path)
     luminance, found = (picture @ SRGB_TO_XYZ[1] for picture in (ours, cycles))
     labels, count = ndimage.label(ndimage.maximum_filter(luminance > 0.02 * luminance.max(), 3))
     light = ndimage.sum(luminance, labels, range(1, count + 1))
-    checked = 0
-    for k in np.flatnonzero(light > 0.03 * light.sum()) + 1:
+    bright = np.flatnonzero(light > 0.03 * light.sum()) + 1
+    assert len(bright) >= case.regions
+    low, high = case.luminance
+    for k in bright:
         region = labels == k
         at = np.argwhere(region)
-        assert found[region].sum() == pytest.approx(luminance[region].sum(), rel=0.1)
+        colours = [picture[region].mean(axis=0) for picture in (ours, cycles)]
+        scaled = [linear_sRGB_to_XYZ(0.4 * colour / (colour @ SRGB_TO_XYZ[1])) for colour in colours]
+        ratio, error = found[region].sum() / luminance[region].sum(), delta_E(*scaled)
+        print(f"{case}: {light[k - 1] / light.sum():.2f} of the light: {ratio:.3f}, {error:.1f}")
+        assert low < ratio < high
+        assert error < case.max_delta_E
         centres = [np.average(at, axis=0, weights=np.maximum(picture[region], 0)) for picture in (luminance, found)]
         width = np.sqrt(np.average(((at - centres[0]) ** 2).sum(axis=1), weights=np.maximum(luminance[region], 0)))
         assert np.hypot(*(centres[1] - centres[0])) < width / 2
-        colours = [picture[region].mean(axis=0) for picture in (ours, cycles)]
-        scaled = [linear_sRGB_to_XYZ(0.4 * colour / (colour @ SRGB_TO_XYZ[1])) for colour in colours]
-        # Nodes have no negative weights, and so no colours outside of sRGB.
-        assert delta_E(*scaled) < (5 if suffix == ".osl" else 8)
-        checked += 1
-    assert checked >= (1 if shape == "sphere" else 2)  # whose orders touch each other
 
 
 @pytest.mark.slow
