@@ -37,6 +37,7 @@ class UnshadowedLight:
 
     Attributes:
         has_extent: whether there are lamps with an extent, or an environment; otherwise h is of no use.
+        has_outlines: whether there are lamps with an extent.
     """
 
     def __init__(self, scene: mi.Scene) -> None:
@@ -45,7 +46,8 @@ class UnshadowedLight:
         lamps = [shape for shape in scene.shapes() if shape.is_emitter() and not shape.emitter().flags() & delta]
         radiance = _radiance(scene, lamps)
         environment = scene.environment()
-        self.has_extent = bool(lamps) or environment is not None
+        self.has_outlines = bool(lamps)
+        self.has_extent = self.has_outlines or environment is not None
         groups = _groups(np.array([_bounds(shape) for shape in lamps]).reshape(-1, 2, 3))
         self._outlines = [_Outline([lamps[k] for k in group], radiance[group].max()) for group in groups]
         self._map = None if environment is None else _environment_map(environment)

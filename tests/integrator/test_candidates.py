@@ -236,6 +236,22 @@ def test_instances_draw_candidates(llvm):
 
 
 @pytest.mark.slow
+@pytest.mark.parametrize(
+    ("name", "lights", "expected"),
+    [("blazed", "sky", True), ("blazed", "lamp", True), ("skin", "sky", False), ("skin", "lamp", True)],
+)
+def test_candidates_are_drawn_where_they_reduce_the_noise(name, lights, expected, llvm):
+    """Narrow lobes gain below a uniform sky, a continuum does not; equal numbers of rays, lobes of 0.01 cycles/µm."""
+    bsdf = {"blazed": surface(), "skin": surface("elaphe", 2.0)}[name]
+    built = scene(bsdf, **{lights: {"sky": {"type": "constant", "radiance": uniform(1.0)}, "lamp": lamp()}[lights]})
+    path, ours = (mi.load_dict({"type": kind, "max_depth": 2}) for kind in ("path", "diffraction_path"))
+    eye, _ = ours.parts(built, mi.load_dict({"type": "perspective", "to_world": towards(EYE.tolist())}))
+    (wanted, its_error), (found, error) = (estimates(built, tracer, 2**14) for tracer in (path, eye))
+    np.testing.assert_array_less(np.abs(found - wanted), 4 * np.hypot(its_error, error))
+    ratio = np.mean(error**2) / np.mean(its_error**2)
+    assert (ratio < 0.5) == expected, ratio
+
+
 def test_each_of_several_gratings_draws_its_own_candidates(llvm):
     """Three plates with a BSDF each and two with the same, of which each stands at the origin once."""
     bsdfs = [surface("elaphe", 26.0), surface(), profile(material="Al", coat_ior=1.5), surface("sinusoidal")]
