@@ -1,4 +1,4 @@
-"""Scalar theory beside Maxwell's equations for a published splitter, as `tools/data/splitters.py` stores its orders."""
+"""Scalar theory beside Maxwell's equations for published splitters, as `tools/data/splitters.py` stores its orders."""
 
 import json
 
@@ -21,11 +21,12 @@ def orders(case, name="orders"):
     return np.reshape(case[name], (7, 7))
 
 
-@pytest.mark.parametrize("case", CASES, ids=lambda case: case["design"][-16:])
-def test_scalar_theory_has_an_eighth_less_light_in_the_target(case):
-    found = splitters.scalar(splitters.stored_pillars(case), case["height"])
-    assert found.sum() / orders(case).sum() == pytest.approx(0.87, abs=0.01)
-    assert np.median(np.abs(found - orders(case)) / orders(case)) == pytest.approx(0.126, abs=0.02)
+def test_scalar_theory_has_less_light_in_the_target():
+    """By the amounts that docs/validation.md states."""
+    for case, less, median in zip(CASES, (0.13, 0.29, 0.18), (0.13, 0.28, 0.17), strict=True):
+        found = splitters.scalar(splitters.stored_pillars(case), case["height"])
+        assert found.sum() / orders(case).sum() == pytest.approx(1 - less, abs=0.01)
+        assert np.median(np.abs(found - orders(case)) / orders(case)) == pytest.approx(median, abs=0.01)
 
 
 def test_the_stored_orders_are_those_of_coupled_waves():
