@@ -5,8 +5,8 @@ glass, n = 1.46, on glass, in pixels of 0.04 µm and a period of 7.2 µm, which 
 at normal incidence, into 7 × 7 orders in air. Each is solved by `volume_integral`, for unpolarised light, with `LAYERS`
 layers of voxels and with one and a half times as many; the error decreases with the square of their thickness and is
 extrapolated (Richardson). A weak order needs that, as its amplitude is a small difference of large ones: order 0 of the
-stored designs is 54 to 74 % too strong with 18 layers. The voxels are the pixels, whose walls are thus exact. Two minutes of
-processor time, or twice as many for a design that is not symmetric about its diagonal. Results are added to
+stored designs is 54 to 74 % too strong with 18 layers. The voxels are the pixels, whose walls are thus exact. Two
+minutes of processor time, or twice as many for a design that is not symmetric about its diagonal. Results are added to
 `tests/data/splitters.json`, which docs/validation.md reads. Without an argument the stored results are printed.
 """
 
