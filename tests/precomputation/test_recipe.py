@@ -361,6 +361,14 @@ def test_the_cache_is_read_the_second_time(own_cache, builds):
     assert first[1:] == second[1:]
 
 
+def test_a_file_in_the_cache_of_another_recipe_is_replaced(own_cache, builds):
+    one, other = (Recipe(CROSSED, ScalarSettings(**{**FAST, "coherence_length": length})) for length in (20.0, 25.0))
+    one.cached()
+    (own_cache / f"{one.digest()}.exr").rename(own_cache / f"{other.digest()}.exr")
+    assert other.cached().settings.coherence_length == 25.0
+    assert len(builds) == 2
+
+
 def test_a_spectrum_in_use_is_neither_built_nor_read_again(own_cache, builds):
     recipe = Recipe(CROSSED, ScalarSettings(**FAST))
     first = recipe.cached()
