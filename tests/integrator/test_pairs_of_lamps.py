@@ -29,9 +29,9 @@ AT = ORDERS[0], [1.4, 0.9, 1.6]  # of two lamps
 BLACK = {"type": "diffuse", "reflectance": 0.0}
 
 
-def area(position, kind="area", **parameters):
-    emitter = {"type": kind, "radiance": uniform(4.0), **parameters}
-    return {"type": "disk", "to_world": towards(position).scale(0.7), "emitter": emitter, "bsdf": BLACK}
+def area(position, kind="area", radius=0.7, **parameters):
+    emitter = {"type": kind, "radiance": uniform(2.0 / radius**2), **parameters}
+    return {"type": "disk", "to_world": towards(position).scale(radius), "emitter": emitter, "bsdf": BLACK}
 
 
 def environment(**parameters):
@@ -128,9 +128,10 @@ def test_a_hidden_lamp_is_dark_beside_another():
     np.testing.assert_array_less(np.abs(found - wanted), 4 * error + 1e-3 * wanted.max())
 
 
-def test_an_area_lamp_that_is_never_drawn_keeps_its_light():
-    """Beside a bulb, and a lamp whose direction no sample finds."""
-    lamps = {"area": LAMPS["area"](AT[0], sampling_weight=0.0), "bulb": LAMPS["bulb"](AT[1])}
+@pytest.mark.parametrize(("weight", "radius"), [(0.0, 0.7), (1.0, 0.1)])
+def test_an_area_lamp_keeps_its_light_beside_lamps_without_extent(weight, radius):
+    """Beside a bulb, and a lamp whose direction no sample finds; as often found by candidates, if small, as drawn."""
+    lamps = {"area": LAMPS["area"](AT[0], radius=radius, sampling_weight=weight), "bulb": LAMPS["bulb"](AT[1])}
     lamps["directed"] = LAMPS["directionalarea"](ORDERS[1])
     assert_bins_agree(scene(blaze(2.0), lamps), count=2**17)
 
