@@ -135,6 +135,12 @@ FIGURES = (
         8,
     ),
     Figure(
+        ("interactive.png",),
+        "python tools/manual/viewer_speed.py {out}/interactive.png",
+        8,
+        needs="Chromium (tools/manual/live_browser.py)",
+    ),
+    Figure(
         ("viewer.png", "viewer_snake.png"),
         """python tools/manual/viewer_picture.py {out}/viewer.png --frames 12
         python tools/manual/viewer_picture.py {out}/viewer_snake.png --surface xenopeltis --frames 12""",

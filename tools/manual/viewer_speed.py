@@ -1,4 +1,4 @@
-"""Print a table of docs/speed.md and draw docs/interactive.png: interactive shaders, the time of a frame, the error.
+"""Draw docs/interactive.png, and print its numbers: interactive shaders, the time of a frame, the error.
 
     python tools/manual/viewer_speed.py docs/interactive.png
 
@@ -28,6 +28,7 @@ from mitsuba_diffraction.variants import choose_variant
 SIZE, SPP = 128, 128
 VIEWPORT = {"width": 960, "height": 560}
 NAMES = {"none": "this model", "flss": "FLSS", "nmm": "NMM", "pq": "PQ", "nmm_pq": "NMM with PQ", "gem": "GEM"}
+MARKERS = {"none": "o", "flss": "s", "nmm": "^", "pq": "D", "nmm_pq": "v", "gem": "x"}
 TICKS = os.sysconf("SC_CLK_TCK")
 
 
@@ -40,16 +41,18 @@ def processor_seconds(process: int) -> float:
     return total + (int(fields[11]) + int(fields[12])) / TICKS
 
 
-def frame_time(tab: Page, side: str, frames: int) -> float:
-    """Return milliseconds of the processor for a frame of a side, beside the geometry."""
+def frame_time(tab: Page, side: str) -> float:
+    """Return milliseconds of the processor for a frame of a side, beside the geometry, from half a second of frames."""
     text = """([side, frames]) => { const { renderer, state } = viewer;
       for (let k = 0; k < frames; k++) {
         renderer.geometryFrame = renderer[side].frame;
         renderer.draw(renderer[side], state, [0, 1], Infinity);
       } }"""
-    before = processor_seconds(os.getpid())
-    tab.evaluate(text, [side, frames])
-    return 1e3 * (processor_seconds(os.getpid()) - before) / frames
+    before, frames, spent = processor_seconds(os.getpid()), 0, 0.0
+    while spent < 0.5:
+        tab.evaluate(text, [side, count := max(frames, 1)])
+        frames, spent = frames + count, processor_seconds(os.getpid()) - before
+    return 1e3 * spent / frames
 
 
 def mean_of(tab: Page, side: str) -> np.ndarray[Any, Any]:
@@ -86,9 +89,25 @@ def measured(surface: str) -> dict[str, tuple[float, float]]:
             exposure = auto_exposure(into_gamut(XYZ_to_linear_sRGB(reference)))
             error = delta_E(*(np.clip(exposure * XYZ, 0, 1) for XYZ in (own, reference))).mean()
             tab.evaluate("viewer.state.maxFrames = 0")
-            found[variant] = frame_time(tab, side, 50 if side == "model" else 1), float(error)
+            found[variant] = frame_time(tab, side), float(error)
             print(surface, NAMES[variant], "{:.0f} ms, ΔE00 {:.2f}".format(*found[variant]), flush=True)
     return found
+
+
+def plot(results: dict[str, dict[str, tuple[float, float]]], path: Path) -> None:
+    """Draw (milliseconds, ΔE00) of each shader, a panel for each surface."""
+    figure, axes = plt.subplots(1, len(results), figsize=(7, 3.4), sharey=True, squeeze=False)
+    for axis, (surface, shaders) in zip(axes[0], results.items(), strict=True):
+        for variant, (time, error) in shaders.items():
+            axis.plot(time, error, MARKERS[variant], color="C3" if variant == "none" else "C0", label=NAMES[variant])
+        axis.set(xscale="log", yscale="log", xlabel="time of a frame in ms", title=SURFACES[surface][0])
+        axis.margins(x=0.22, y=0.15)
+        axis.grid(alpha=0.3)
+    axes[0, 0].set_ylabel("mean ΔE00")
+    axes[0, -1].legend(loc="lower right")
+    figure.tight_layout()
+    figure.savefig(path, dpi=110)
+    plt.close(figure)
 
 
 def main() -> None:
@@ -99,16 +118,7 @@ def main() -> None:
     import mitsuba as mi  # after LLVM has been chosen
 
     mi.set_variant(choose_variant())
-    figure, axes = plt.subplots(1, len(options.surfaces), figsize=(8, 3.4), sharey=True, squeeze=False)
-    for axis, surface in zip(axes[0], options.surfaces, strict=True):
-        for variant, (time, error) in measured(surface).items():
-            axis.plot(time, error, "o", color="C3" if variant == "none" else "C0")
-            axis.annotate(NAMES[variant], (time, error), xytext=(5, 4), textcoords="offset points", fontsize=8)
-        axis.set(xscale="log", yscale="log", xlabel="processor time of a frame in ms", title=SURFACES[surface][0])
-        axis.margins(x=0.25, y=0.15)
-    axes[0, 0].set_ylabel("mean ΔE00 from the path-traced picture")
-    figure.tight_layout()
-    figure.savefig(options.output, dpi=110)
+    plot({surface: measured(surface) for surface in options.surfaces}, options.output)
 
 
 if __name__ == "__main__":
