@@ -39,9 +39,10 @@ SURFACES = {
 }
 
 
-def viewed(name):
+def viewed(name, **settings):
     surface, material, coat, _ = SURFACES[name]
     recipe = md.Recipe.load(md.examples_folder() / "precompute" / f"{surface}.toml")
+    recipe = replace(recipe, settings=replace(recipe.settings, **settings))
     if coat:
         recipe = replace(recipe, settings=replace(recipe.settings, wavelengths=(360 / coat, 830.0)))
     return Viewed(recipe.cached(), MediumBelow.of(material), coat / AIR if coat else 1.0)
@@ -120,9 +121,7 @@ def test_a_look_up_has_the_colour_of_the_bsdf(name, llvm):
 @pytest.mark.parametrize("length", [14.0, 9.0, 25.0, 40.0])
 def test_lobes_of_any_width_have_the_colour_of_the_integral(length, monkeypatch):
     monkeypatch.setattr(colour_table, "PAIRS", 400)
-    recipe = md.Recipe.load(md.examples_folder() / "precompute" / "blaze.toml")
-    recipe = replace(recipe, settings=replace(recipe.settings, coherence_length=length))
-    surface = Viewed(recipe.cached(), MediumBelow.of("Au"))
+    surface = viewed("blaze", coherence_length=length)
     assert surface.has_separate_orders
     assert colours_of(surface).error.is_small
 

@@ -5,14 +5,16 @@ import http.server
 import json
 import shutil
 import threading
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
-from test_colour_table import directions, face, viewed
+from test_colour_table import SURFACES, directions, face, viewed
 
 from mitsuba_diffraction.export import colour_file
 from mitsuba_diffraction.export.colour_file import write_colours
+from mitsuba_diffraction.export.colour_table import colours_of
 from mitsuba_diffraction.optics.color import (
     SRGB_TO_XYZ,
     XYZ_to_linear_sRGB,
@@ -106,17 +108,14 @@ def difference(found, wanted):
 
 @pytest.fixture(scope="module")
 def exported(folder):
-    """exported(name): surface and colours; the file is NAME.bin."""
+    """exported(name): surface and colours; the file is NAME.bin unless it has a name of its own."""
 
     @functools.cache
-    def of(name):
-        surface = viewed(name)
-        return surface, write_colours(surface, folder / f"{name.replace(' ', '_')}.bin")
+    def of(name, file=None, **settings):
+        surface = viewed(name, **settings)
+        return surface, write_colours(surface, folder / f"{file or name.replace(' ', '_')}.bin")
 
     return of
-
-
-SURFACES = ("blaze", "foil of gold", "skin", "compact disc")
 
 
 @pytest.mark.slow
@@ -142,13 +141,13 @@ def unit(v):
     return v / np.linalg.norm(v, axis=-1, keepdims=True)
 
 
-def seen():
-    """Points on z = 0 below the centres of pixels, (n, 3), by a perspective camera of 40° that looks at the origin."""
+def seen(size=SIZE, offset=(0.5, 0.5)):
+    """Points on z = 0 in pixels, (n, 3), by a perspective camera of 40° that looks at the origin."""
     z = unit(EYE)
     x = unit(np.cross([0, 1, 0], z))
     y = np.cross(z, x)
-    at = (np.arange(SIZE) + 0.5) / SIZE * 2 - 1
-    across, up = (np.tan(np.deg2rad(20)) * a.ravel() for a in np.meshgrid(at, at))
+    at = [(np.arange(size) + shift) / size * 2 - 1 for shift in offset]
+    across, up = (np.tan(np.deg2rad(20)) * a.ravel() for a in np.meshgrid(*at))
     rays = across[:, None] * x + up[:, None] * y - z
     return EYE - rays * (EYE[2] / rays[:, 2])[:, None]
 
@@ -227,28 +226,44 @@ def test_a_lit_plane_has_the_colours_of_its_directions(name, options, exported, 
 @pytest.mark.parametrize("name", ["skin", "foil of gold"])
 def test_a_rectangle_lights_by_its_area(name, exported, tab):
     surface, colours = exported(name)
-    position, (width, height), count = np.array([-0.5, 2.1, 3.0]), (0.8, 0.3), 24
-    shown = {"eye": EYE.tolist(), "position": position.tolist(), "size": SIZE, "material": {}, "light": "area"}
-    found = call(tab, "plane", f"{name.replace(' ', '_')}.bin", {**shown, "sizes": [width, height]})[:, :3]
+    position, (width, height), count, fine = np.array([-0.5, 2.1, 3.0]), (0.8, 0.3), 24, 192
+    shown = {"eye": EYE.tolist(), "position": position.tolist(), "material": {}, "light": "area"}
+    shown["sizes"] = [width, height]
+    file = f"{name.replace(' ', '_')}.bin"
+    pictures = [call(tab, "plane", file, {**shown, "size": n})[:, :3] for n in (SIZE, fine)]
     assert not tab.messages, "\n".join(tab.messages)[:3000]
-    points = seen()
     z = unit(position)
     x = unit(np.cross([0, 1, 0], z))
-    places = (np.arange(count) + 0.5) / count - 0.5
-    wo, wanted = unit(EYE - points), 0
-    for s in places:
-        for t in places:
-            away = position + s * width * x + t * height * np.cross(z, x) - points
-            wi, square = unit(away), (away**2).sum(axis=1, keepdims=True)
-            area = width * height / count**2 * (wi @ z)[:, None] / square
-            wanted = wanted + f_cos(surface, colours, wi, wo) * area
-    inside = (np.abs(points[:, :2]) < 0.9).all(axis=1)
-    found, wanted = (found @ SRGB_TO_XYZ.T)[inside], mixed(wanted)[inside]
-    error = difference(found, wanted)
+    area, points, middle, flux = width * height / count**2, seen(), 0, 0.0
+    for k in range(count**2):
+        s, t = (k % count + 0.5) / count - 0.5, (k // count + 0.5) / count - 0.5
+        place = position + s * width * x + t * height * np.cross(z, x)
+        middle = middle + area * from_point(surface, colours, points, place, z)
+        if name == "skin":
+            # Few pixels have the image of the lamp in the mirror direction: the flux is that of points all over them.
+            spread = seen(offset=((0.5 + 0.7548776662 * k) % 1, (0.5 + 0.5698402910 * k) % 1))
+            flux += area * from_point(surface, colours, spread, place, z)[is_inside(spread), 1].sum() / SIZE**2
+    found, summed = (picture @ SRGB_TO_XYZ.T for picture in pictures)
+    inside = is_inside(points)
+    error = difference(found[inside], mixed(middle)[inside])
     assert error.mean() < 1
     assert np.percentile(error, 95) < 5
-    # Not within 3 %: soft edges leave less in the few pixels of the image of the lamp.
-    assert found.sum() == pytest.approx(wanted.sum(), rel=0.06)
+    # The lobes of the foil are too narrow for these sums.
+    if name == "skin":
+        assert summed[is_inside(seen(fine)), 1].sum() / fine**2 == pytest.approx(flux, rel=0.03)
+
+
+def is_inside(points):
+    """Whether points are on the plane, beside its edge."""
+    return (np.abs(points[:, :2]) < 0.9).all(axis=1)
+
+
+def from_point(surface, colours, points, position, normal):
+    """XYZ of the light of a unit of area at a position, (n, 3)."""
+    away = position - points
+    wi = unit(away)
+    per_area = (wi @ normal)[:, None] / (away**2).sum(axis=1, keepdims=True)
+    return f_cos(surface, colours, wi, unit(EYE - points)) * per_area
 
 
 @pytest.mark.slow
@@ -264,6 +279,35 @@ def test_a_file_that_cannot_be_read_is_grey_and_says_so_once(exported, folder, t
         grey = call(tab, "plane", f"{name}.bin", shown)[27, :3]
         assert np.ptp(grey) < 1e-3 < grey.min()
         assert tab.messages == [f"DiffractionMaterial: {name}.bin: {problem}; shown in grey"]
+
+
+@pytest.mark.slow
+def test_the_heights_of_separate_orders_have_a_scale(exported, tab):
+    """Beside colours of scaled heights; lobes are wide, as few pixels would see narrow ones."""
+    surface, colours = exported("blaze", "scaled", coherence_length=14.0)
+    position, points, scale = np.array([-0.5, 2.1, 3.0]), seen(), 0.6
+    shown = {"eye": EYE.tolist(), "position": position.tolist(), "size": SIZE, "light": "directional"}
+    found = call(tab, "plane", "scaled.bin", {**shown, "material": {"heightScale": scale}})[:, :3] @ SRGB_TO_XYZ.T
+    assert not tab.messages, "\n".join(tab.messages)[:3000]
+    both = (colours_of(replace(surface, height_scale=scale)), colours)
+    frame, inside = axes(points, 0, radial=False), is_inside(points)
+    wanted, unscaled = (mixed(lit(surface, c, points, frame, position, "directional"))[inside] for c in both)
+    assert difference(found[inside], wanted).mean() < 0.3
+    assert found[inside].sum() == pytest.approx(wanted.sum(), rel=0.03)
+    assert difference(unscaled, wanted).mean() > 1
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(("name", "scale", "wanted"), [("skin", 0.8, "1, as orders overlap"), ("blaze", 1.5, "0 to 1")])
+def test_heights_that_a_file_does_not_hold_are_refused(name, scale, wanted, exported, tab):
+    exported(name)
+    shown = {"eye": EYE.tolist(), "position": [-0.5, 2.1, 3.0], "size": 8, "light": "directional"}
+    pictures = [
+        call(tab, "plane", f"{name}.bin", {**shown, "material": material}) for material in ({}, {"heightScale": scale})
+    ]
+    np.testing.assert_array_equal(*pictures)
+    problem = f"heightScale: got {scale}, wanted {wanted}; export with height_scale, shown with 1"
+    assert tab.messages == [f"DiffractionMaterial: {problem}"]
 
 
 def under_white_sky(surface, wo):

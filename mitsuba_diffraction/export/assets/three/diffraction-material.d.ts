@@ -29,7 +29,7 @@ export interface DiffractionMaterialParameters {
   radial?: boolean;
   /** Directions of the environment map in which overlapping orders are looked up, at most 256; default 64. */
   skyPoints?: number;
-  /** Factor of the heights, of separate orders; default 1. */
+  /** Factor of the heights of separate orders, 0 to 1; others are refused in the console and shown with 1, the default. */
   heightScale?: number;
   /** Parameters of MeshStandardMaterial: color (the base), envMap, side, emissive, opacity, … */
   [parameter: string]: unknown;

@@ -224,12 +224,16 @@ export class DiffractionMaterial extends MeshStandardMaterial {
     super({ color: data === null ? 0x808080 : data.base, ...parameters });
     this.diffraction = data;
     if (data === null) return;
-    if (heightScale !== 1 && data.kind === 'table') throw new Error('heightScale: wanted separate orders; export with height_scale');
+    const canScale = heightScale === 1 || (data.kind === 'orders' && heightScale >= 0 && heightScale < 1);
+    if (!canScale) {
+      const wanted = data.kind === 'orders' ? '0 to 1' : '1, as orders overlap';
+      console.error(`DiffractionMaterial: heightScale: got ${heightScale}, wanted ${wanted}; export with height_scale, shown with 1`);
+    }
     const stated = orientation ?? data.orientation ?? 0, isNamed = stated in FROM_RADIUS;
     this.defines = { ...this.defines, USE_UV: '' };
     this.shading = {
       uOrientation: { value: (isNamed ? FROM_RADIUS[stated] : stated) * Math.PI / 180 }, uIsRadial: { value: radial ?? isNamed },
-      uSkyPoints: { value: data.skyPoints ?? skyPoints }, uHeightScale: { value: heightScale },
+      uSkyPoints: { value: data.skyPoints ?? skyPoints }, uHeightScale: { value: canScale ? heightScale : 1 },
       uDirectionalRadii: { value: [] }, uPointRadii: { value: [] }, uSpotRadii: { value: [] },
       ...Object.fromEntries(Object.entries(data.uniforms).map(([name, value]) => [name, { value }])),
     };
