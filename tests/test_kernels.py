@@ -196,14 +196,19 @@ def test_bodies_of_loops_are_recorded_once(monkeypatch):
     own = [eye.candidates, *(layer for grating in gratings for layer in (grating.layers, grating.layers.grating))]
     sampler = sensor.sampler()
     sampler.seed(0, 64)
-    for kind, name in ((Candidates, "sample"), (Candidates, "_kept_of"), (Layers, "sample"), (Grating, "evaluate")):
+    for kind, name in (
+        (Candidates, "sample"),
+        (Candidates, "_kept_of"),
+        (Layers, "sample"),
+        (Grating, "value_and_density"),
+    ):
         count(kind, name)
     ray, weight = sensor.sample_ray_differential(0, sampler.next_1d(), sampler.next_2d(), mi.Point2f(0.5))
     eye.trace(built, sampler, ray, weight)
-    assert calls == {"sample": 6, "_kept_of": 1, "evaluate": 4}
+    assert calls == {"sample": 6, "_kept_of": 1, "value_and_density": 4}
     calls.clear()
     next(light.splats(0, 4))
-    assert calls == {"sample": 1, "evaluate": 1}
+    assert calls == {"sample": 1, "value_and_density": 1}
 
 
 # Pairs of a grating and of further shapes.

@@ -325,7 +325,7 @@ def test_indices_are_read_within_their_table_at_and_beyond_its_ends(llvm, capfd,
     nm = [0.0, 1e-3, float(table.first[0]), 550.0, max(1e3 * index.wavelengths[-1] for index in indices), 1e9]
     for number, index in enumerate(indices):
         with dr.scoped_set_flag(dr.JitFlag.Debug, True):
-            found = table.at(table.position(floats(nm)), mi.UInt32(number))
+            found = table.index_at(table.position(floats(nm)), mi.UInt32(number))
             dr.eval(found)
         np.testing.assert_allclose(np.array(found), index(1e-3 * np.array(nm)), rtol=1e-5)
     assert "out-of-bounds" not in capfd.readouterr().err

@@ -263,7 +263,7 @@ def test_all_orders_that_propagate_in_a_medium_with_dispersion_can_be_drawn():
     interface = Interface(eta=floats(n), kappas=kappas, transmitted_fraction=table.transmitted_fraction)
     k_i = interface.wave_vector(vectors(omega))
     incidence = Incidence.of(k_i, interface.scattered(k_i, on_device(reflects, mi.Bool)), interface)
-    incidence = incidence.at(floats(wavelength))
+    incidence = incidence.at_wavelength(floats(wavelength))
     # The first and the last order, by the grating equation.
     n_i, n_o = (np.where(of_side, 1, n) for of_side in (above, above == reflects))
     square = n_o**2 - (n_i * omega[:, 1]) ** 2
