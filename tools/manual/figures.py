@@ -66,6 +66,12 @@ FIGURES = (
         needs="a Python with bpy as $BLENDER_PYTHON, a checkout of Mitsuba-Blender as $ADDON (scenes/blender.py)",
     ),
     Figure(
+        ("blender_nodes.jpg", "blender_paths.jpg"),
+        "python tools/manual/blender_table.py {out}",
+        10,
+        needs="a Python with bpy as $BLENDER_PYTHON (tools/manual/cycles_picture.py)",
+    ),
+    Figure(
         ("compare.jpg", "compare-others.jpg"),
         """mitsuba-diffraction compare scenes/xenopeltis.xml -D light=sun --pigment --shader flss --shader nmm \
             --shader pq --shader gem --width 516 --spp 64 --shading-points 2 -o {out}/compare""",
