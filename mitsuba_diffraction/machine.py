@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 import os
 from collections.abc import Iterator
-from contextlib import suppress
+from contextlib import contextmanager, suppress
 from pathlib import Path, PurePosixPath
 
 PROCESS, CONTROL_GROUPS = Path("/proc/self"), Path("/sys/fs/cgroup")
@@ -62,6 +62,25 @@ def _address_space() -> int | None:
     limit, _ = resource.getrlimit(resource.RLIMIT_AS)
     used = _entries(PROCESS / "status").get("VmSize", 0)
     return None if limit == resource.RLIM_INFINITY else limit - 1024 * used
+
+
+@contextmanager
+def at_most(number_of_bytes: int) -> Iterator[None]:
+    """Let the block map so much more memory, on Linux: what a library in C allocates cannot be seen before."""
+    used = _entries(PROCESS / "status").get("VmSize")
+    if used is None:
+        yield
+        return
+    import resource
+
+    before = resource.getrlimit(resource.RLIMIT_AS)
+    limit = 1024 * used + number_of_bytes
+    if before[0] == resource.RLIM_INFINITY or limit < before[0]:
+        resource.setrlimit(resource.RLIMIT_AS, (limit, before[1]))
+    try:
+        yield
+    finally:
+        resource.setrlimit(resource.RLIMIT_AS, before)
 
 
 def _control_groups(controller: str) -> Iterator[Path]:

@@ -538,6 +538,16 @@ def _datx(deep=False):
     return bytes(content)
 
 
+def _endless_heap():
+    """A file of Zygo whose heap of texts ends with free space of no length, so that HDF5 never comes to its end."""
+    content = bytearray(foreign_scans.datx())
+    at = content.index(b"GCOL") + 16
+    while struct.unpack_from("<H", content, at)[0]:
+        at += 16 + (struct.unpack_from("<Q", content, at + 8)[0] + 7) // 8 * 8
+    struct.pack_into("<Q", content, at + 8, 0)
+    return bytes(content)
+
+
 def _aliases():
     lists = "".join(f"a{i}: &a{i} [{', '.join(8 * [f'*a{i - 1}' if i else '1'])}]\n" for i in range(8))
     return f"{lists}DATA:\n  - type: formula 1\n    wavelength_range: 0.3 2\n    coefficients: *a7\n".encode()
@@ -583,6 +593,7 @@ SLOWLY_CRAFTED = {
     ),
     "linked_heights": (".h5-jpk", lambda: _h5_jpk(_linked), _INSTRUMENT),
     "long_texts": (".datx", _datx, _INSTRUMENT),
+    "endless_heap": (".datx", _endless_heap, _INSTRUMENT),
     "deep_groups": (".datx", lambda: _datx(deep=True), _INSTRUMENT),
     "elements_of_another": (
         ".plux",

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import struct
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -11,14 +12,17 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from ...errors import RequestError
-from ...files.reading import MAX_NESTING, check_array, check_unpacked, read_bytes
+from ...files.reading import MAX_EXPANSION, MAX_NESTING, check_array, check_unpacked, read_bytes
+from ...machine import at_most
 from .scan import EXTRA
 
 if TYPE_CHECKING:
     import h5py
 
 MAX_OBJECTS = 2**12  # groups, data sets and attributes
-_HEAP = b"GCOL\1\0\0\0"  # of values of variable length, such as texts; its size follows, in 8 bytes
+_MEMORY = 2**29  # bytes for what a file declares, beside multiples of its own
+_HEAP = b"GCOL\1\0\0\0"  # of values of variable length, such as texts; its size follows, then entries
+_HEAP_SIZE, _HEAP_ENTRY = struct.Struct("<Q"), struct.Struct("<H6xQ")  # of an entry its number and length
 
 
 @contextmanager
@@ -38,7 +42,9 @@ def opened(path: Path) -> Iterator[h5py.File]:
         texts = sum(_check(node, len(content)) for node in _nodes(file))
         # Several texts may be one and the same in the file.
         check_unpacked(texts * _largest_heap(content), len(content))
-        yield file
+        # Of a text the length is known to the library alone, which allocates it before it looks.
+        with at_most(_MEMORY + MAX_EXPANSION * len(content)):
+            yield file
 
 
 def _nodes(root: h5py.Group) -> Iterator[h5py.Group | h5py.Dataset]:
@@ -95,10 +101,22 @@ def _texts(kind: np.dtype) -> int:
 
 
 def _largest_heap(content: bytes) -> int:
-    """Return the number of bytes that one value of variable length has at most."""
+    """Return the number of bytes that one value of variable length has at most.
+
+    Raises:
+        RequestError: if a heap is damaged: the library, which walks through it, would never come to its end.
+    """
     largest, at = 0, content.find(_HEAP)
     while at >= 0:
-        at += len(_HEAP)
-        largest = max(largest, int.from_bytes(content[at : at + 8], "little"))
-        at = content.find(_HEAP, at)
+        size, *_ = _HEAP_SIZE.unpack_from(content.ljust(at + 16, b"\0"), at + len(_HEAP))
+        largest, end = max(largest, size), min(at + size, len(content))
+        entry = at + len(_HEAP) + _HEAP_SIZE.size
+        while entry + _HEAP_ENTRY.size <= end:
+            number, length = _HEAP_ENTRY.unpack_from(content, entry)
+            # The entry 0 is what is free, with its own head.
+            step = length if number == 0 else _HEAP_ENTRY.size + length
+            if step < _HEAP_ENTRY.size or step > end - entry:
+                raise RequestError("got HDF5 with a damaged heap of texts")
+            entry += step + -step % 8
+        at = content.find(_HEAP, at + len(_HEAP))
     return min(largest, len(content))

@@ -9,7 +9,7 @@ import logging
 import re
 import warnings
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, nullcontext
 from pathlib import Path
 
 import numpy as np
@@ -59,10 +59,8 @@ def read_instrument(path: Path, unit: str | tuple[str, str] | None, channel: str
         library = lookup_reader_by_format[name]
         contents, doubts, has_unit_of_heights = workarounds.rewritten(path, name)
         try:
-            if name == "datx":
-                with hdf5.opened(path):
-                    pass  # is checked
-            found = {c.index: c for c in library(contents).channels}
+            with hdf5.opened(path) if name == "datx" else nullcontext():
+                found = {c.index: c for c in library(contents).channels}
             chosen = choose_channel(
                 [
                     Channel(number, c.name or "untitled", c.dim == 2 and c.data_kind.value == "height", c.dim == 1)
