@@ -52,7 +52,7 @@ from .unshadowed_light import UnshadowedLight
 CANDIDATES, LATER_CANDIDATES = 16, 8  # M, at the first vertex that scatters, and at later ones, which have J = 1
 SLOTS, SLOTS_OF_CONTINUA = 4, 1  # J
 DEFENSIVE_FRACTION = 0.1  # β
-MIN_GAIN = 6.0  # of h by light samples over that in all directions, from which candidates of continua are drawn
+MIN_GAIN = 6.0  # of h by light samples over that in all directions, from which candidates are drawn in doubt
 MAX_NARROW_LOBE = 0.05  # σ_q in cycles/µm, up to which each wavelength has its own slot
 _AT_ONCE = 4  # candidates drawn in an iteration, of which M is a multiple
 _DIRECTIONS = 2**15  # for this comparison
@@ -138,14 +138,15 @@ class Candidates:
         """Return J of a shape with these points.
 
         Where lobes are narrow, candidates help below a uniform sky, too: each has a wavelength and an order of its own.
-        A continuum needs lamps that are much brighter than other directions; an environment alone is found as well by
-        its own samples.
+        Not so beside a sun, whose noise is left. A continuum needs lamps that are much brighter than other directions;
+        an environment alone is found as well by its own samples.
         """
         if not self.light.has_extent:
             return 0
-        if all(_has_narrow_lobes(grating.spectrum) for grating in gratings_in(shape.bsdf())):
+        narrow = all(_has_narrow_lobes(grating.spectrum) for grating in gratings_in(shape.bsdf()))
+        if narrow and self.light.is_whole:
             return SLOTS
-        if not self.light.has_outlines:
+        if not (narrow or self.light.has_outlines):
             return 0
         u, v = (mi.Point2f(numbers.x, numbers.y) for numbers in map(_random, (1, 2)))
         si = dr.zeros(mi.SurfaceInteraction3f, _DIRECTIONS)
@@ -158,7 +159,7 @@ class Candidates:
         )
         if float(of_lights[0]) < MIN_GAIN * float(dr.mean(self.light(si.p, anywhere, True))[0]):
             return 0
-        return SLOTS_OF_CONTINUA
+        return SLOTS if narrow else SLOTS_OF_CONTINUA
 
     def numbers(self, si: mi.SurfaceInteraction3f, is_later: mi.Bool, active: mi.Bool) -> tuple[mi.UInt32, mi.UInt32]:
         """Return J and M at a point; J is zero where no candidates are drawn."""

@@ -38,6 +38,7 @@ class UnshadowedLight:
     Attributes:
         has_extent: whether there are lamps with an extent, or an environment; otherwise h is of no use.
         has_outlines: whether there are lamps with an extent.
+        is_whole: whether there are no lamps without extent.
     """
 
     def __init__(self, scene: mi.Scene) -> None:
@@ -46,7 +47,7 @@ class UnshadowedLight:
         lamps = [shape for shape in scene.shapes() if shape.is_emitter() and not shape.emitter().flags() & delta]
         radiance = _radiance(scene, lamps)
         environment = scene.environment()
-        self.has_outlines = bool(lamps)
+        self.has_outlines, self.is_whole = bool(lamps), not any(e.flags() & delta for e in scene.emitters())
         self.has_extent = self.has_outlines or environment is not None
         groups = _groups(np.array([_bounds(shape) for shape in lamps]).reshape(-1, 2, 3))
         self._outlines = [_Outline([lamps[k] for k in group], radiance[group].max()) for group in groups]
