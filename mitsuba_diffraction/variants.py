@@ -147,3 +147,11 @@ def choose_variant(requested: str | None = None) -> str:
     if kind == "llvm" and (message := llvm_problem()):
         raise RuntimeError(f"variant {requested!r} cannot be used: {message}")
     return requested
+
+
+def use_threads(count: int) -> None:
+    """Let Dr.Jit use so many threads, two at least: with one, Mitsuba 3.9.1 hangs when it reads or writes an EXR."""
+    import drjit as dr
+
+    if (count := max(2, count)) != dr.thread_count():
+        dr.set_thread_count(count)

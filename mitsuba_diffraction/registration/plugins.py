@@ -15,7 +15,7 @@ import drjit as dr
 import mitsuba as mi
 
 from ..machine import allowed_cores
-from ..variants import is_supported, llvm_problem
+from ..variants import is_supported, llvm_problem, use_threads
 from .wrapped_functions import classes, making, wrap_functions
 
 # Name, registration function of Mitsuba, and the module whose `define` makes the class for the current variant.
@@ -58,9 +58,7 @@ def _refuse(reason: str, props: mi.Properties) -> mi.Object:
 if not getattr(mi, "_mitsuba_diffraction_registered", False):
     wrap_functions([name for name, *_ in PLUGINS])
     mi._mitsuba_diffraction_registered = True
-    # A container may allow fewer cores than Dr.Jit sees. With one thread, Mitsuba 3.9.1 hangs when it reads or writes
-    # an EXR picture.
-    if (threads := max(2, min(dr.thread_count(), allowed_cores()))) != dr.thread_count():
-        dr.set_thread_count(threads)
+    # A container may allow fewer cores than Dr.Jit sees.
+    use_threads(min(dr.thread_count(), allowed_cores()))
 if mi.variant() is not None:
     register_plugins(mi.variant())

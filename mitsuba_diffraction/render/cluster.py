@@ -22,12 +22,12 @@ from functools import lru_cache
 from importlib.machinery import ModuleSpec
 from typing import TYPE_CHECKING
 
-import drjit as dr
 import mitsuba as mi
 import numpy as np
 from numpy.typing import NDArray
 
 from ..errors import RequestError, pip_install
+from ..variants import use_threads
 from .passes import Job, Tracer, content_of, trace_band, versions
 from .trace_pass import LightOfBands
 
@@ -207,9 +207,7 @@ def _trace_on_worker(job: Job, index: int) -> NDArray[np.float32]:
         raise Unsuitable(worker.address, f"a worker has {', '.join(versions())}; wanted {', '.join(job.versions)}")
     with pass_lock:
         mi.set_variant(job.variant)
-        # With one thread, Mitsuba 3.9.1 hangs when it reads an EXR picture.
-        if (threads := max(2, worker.state.nthreads)) != dr.thread_count():
-            dr.set_thread_count(threads)
+        use_threads(worker.state.nthreads)
         try:
             scene = scene_of(job)
         except RuntimeError as error:
