@@ -14,7 +14,7 @@ from ..inspection.efficiency import OrderEfficiencies, order_efficiencies
 from ..inspection.peaks import check_request, efficiencies_of_peaks
 from ..precomputation.grating_spectrum import GratingSpectrum
 from ..precomputation.requested_surface import RequestedSurface
-from ..progress import progress_bar, tell
+from ..progress import progress_bar, say, tell
 from ..scalar_theory.validity import scalar_error
 from ..settings import ScalarSettings
 from .arguments import (
@@ -84,7 +84,9 @@ def efficiency(
             found = efficiencies_of_peaks(cached, media.below, *light, progress)
         warning = cached.warning
     else:
-        field = requested.period
+        field, values = requested.period, requested.recipe.surface
+        if media.transmits and values.get("profile") == "ruled" and "blaze_ior" not in values:
+            say("note", "ruled is blazed for reflected light; blaze_ior=, the index, blazes it for transmission")
         with progress_bar(f"efficiencies of {name}") as progress:
             found = order_efficiencies(field, media, *light, theory, progress)
             warning = scalar_error(field, below=media.below).warning if theory == "scalar" else ""

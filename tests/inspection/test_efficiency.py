@@ -319,3 +319,13 @@ def test_the_command_takes_theory_and_material_of_a_recipe(command):
     _, inside, _ = command("efficiency", f"{transmitting},transmission=interface", "--wavelength", "600")
     assert "rigorous theory, transmitted orders inside" in inside
     assert row[head.index("0") + 1] == row[-1] == "4.000"  # the unit of the wavelength is a word, too
+
+
+@pytest.mark.parametrize(
+    ("values", "says"),
+    [("transmission=interface", True), ("transmission=sheet,blaze_ior=1.5", False), ("material=Al", False)],
+)
+def test_what_blazes_a_ruled_grating_for_transmission_is_named(values, says, command):
+    code, _, err = command(f"efficiency ruled,lines_per_mm=600,{values} --wavelength 500")
+    assert code == 0
+    assert ("blaze_ior=" in err) == says
