@@ -199,7 +199,7 @@ class RigorousSettings(Settings):
 
     Attributes:
         int_ior: index of a dielectric, or n + ik; or a medium with dispersion, or a file.
-        material: or a conductor by Mitsuba's name, a medium with dispersion, or a file (`materials.index_of`).
+        material: or a conductor by Mitsuba's name, a medium with dispersion, or a file (`refractive_indices.index_of`).
         ext_ior: index of the medium above relative to air, for a grating under a coat; wavelengths are measured in this
             medium.
         polarised: whether to store Mueller matrices for polarised variants; the table is then seventeen times as large.

@@ -11,7 +11,7 @@ import pytest
 
 import mitsuba_diffraction as md
 from mitsuba_diffraction import testing
-from mitsuba_diffraction.optics.materials import index_of
+from mitsuba_diffraction.optics.refractive_indices import index_of
 from mitsuba_diffraction.rigorous.build_table import build_rigorous
 from mitsuba_diffraction.rigorous.rigorous_spectrum import Axes, RigorousSpectrum
 from mitsuba_diffraction.settings import RigorousSettings

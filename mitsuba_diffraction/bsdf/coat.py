@@ -15,8 +15,8 @@ from __future__ import annotations
 import drjit as dr
 import mitsuba as mi
 
-from ..optics.materials import RefractiveIndex
 from ..optics.media import Media
+from ..optics.refractive_indices import RefractiveIndex
 from .device_tables import opaque
 from .indices import Dispersion
 

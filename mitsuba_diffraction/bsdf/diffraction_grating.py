@@ -9,7 +9,7 @@ from collections.abc import Sequence
 import mitsuba as mi
 
 from ..errors import RequestError, did_you_mean
-from ..optics.materials import DISPERSION
+from ..optics.refractive_indices import DISPERSION
 from ..parameter_documentation import Parameter, listed
 from ..precomputation.recipe import MAX_PATCHES, Recipe, parameters_of_profile
 from ..surface.gratings import PROFILES

@@ -1,4 +1,4 @@
-"""R(λ, ω_i·h): the power reflectance of the material at the half vector."""
+"""R(λ, ω_i·h): the power reflectance of the boundary between the media, at the half vector."""
 
 from __future__ import annotations
 
@@ -10,8 +10,8 @@ import numpy as np
 
 from ..errors import RequestError
 from ..optics.film_stack import Stack
-from ..optics.materials import MAX_INDEX, MIN_INDEX, KnownRange, RefractiveIndex, constant, index_of, is_file
 from ..optics.media import DEFAULT_INT_IOR, Media, MediumBelow
+from ..optics.refractive_indices import MAX_INDEX, MIN_INDEX, KnownRange, RefractiveIndex, constant, index_of, is_file
 from .coat import Coat
 from .device_tables import opaque
 from .indices import Dispersion, check_spectra, index_from, known_spectrum, nodes_of
@@ -20,19 +20,19 @@ from .mitsuba_internals import nested_plugin
 Cosines: TypeAlias = "mi.Float | mi.UnpolarizedSpectrum"
 
 
-class Material:
-    """The reflectance of a material, from `__call__` or `r_and_t`; by default it has no index and no parameters.
+class Boundary:
+    """The boundary to the medium below: R by `__call__`, R and T by `r_and_t`; by default without index and parameters.
 
     Indices are relative to that of the medium above in the middle of visible light, but for those that methods return,
     which are relative to it at each wavelength. `cos_half` may be one cosine for each wavelength.
 
     Attributes:
-        transparent: whether transmitted light is not absorbed.
+        transparent: whether the medium below does not absorb.
         eta: relative index of refraction in the middle of visible light, a mi.Float; None without an index.
         outside: absolute index of the medium above, to which indices are relative, in the middle of visible light.
         coat: this medium if it has dispersion; else None.
-        varies: whether the material varies over the surface.
-        dispersion: the relative index of a transparent material over the wavelength; None if it is constant.
+        varies: whether an index or a film varies over the surface.
+        dispersion: the relative index of a transparent medium over the wavelength; None if it is constant.
     """
 
     transparent: bool = False
@@ -49,12 +49,12 @@ class Material:
     def r_and_t(
         self, si: mi.SurfaceInteraction3f, cos_half: Cosines, active: mi.Bool
     ) -> tuple[mi.UnpolarizedSpectrum, mi.UnpolarizedSpectrum]:
-        """Return R, and T of a transparent material, at the cosine ω_i·h."""
+        """Return R, and T into a transparent medium, at the cosine ω_i·h."""
         reflected = self(si, cos_half, active)
         return reflected, 1 - reflected
 
     def known_ranges(self) -> tuple[KnownRange, ...]:
-        """Return where each index of the material is known."""
+        """Return where each index is known."""
         return ()
 
     def index(self, si: mi.SurfaceInteraction3f, active: mi.Bool) -> list[mi.Complex2f]:
@@ -66,7 +66,7 @@ class Material:
         return [1.0 if self.coat is None else self.coat.per_nominal(wavelength) for wavelength in si.wavelengths]
 
     def stack(self, eta: float) -> Stack:
-        """Return the transparent material for E and samplers; `eta` replaces a constant index."""
+        """Return the transparent media for E and samplers; `eta` replaces a constant index."""
         raise NotImplementedError
 
     def planes(
@@ -111,8 +111,8 @@ def below_from(props: mi.Properties) -> MediumBelow:
     return MediumBelow("material", None if material == "none" else conductor_from(material))
 
 
-def reflectance_from(props: mi.Properties, media: Media, coat: Coat | None) -> Material:
-    """Return R of the medium below, relative to a coat if there is one; `eta` and `k` are spectra of the scene."""
+def boundary_from(props: mi.Properties, media: Media, coat: Coat | None) -> Boundary:
+    """Return the boundary to the medium below, relative to a coat if there is one; `eta` and `k` are textures."""
     below, above = media.below, None if coat is None or coat.dispersion is None else coat
     if below.parameter == "int_ior":
         assert below.index is not None
@@ -135,7 +135,7 @@ def conductor_from(material: str) -> RefractiveIndex:
         raise RequestError(f"{error}; none is the perfect mirror, R = 1") from None
 
 
-class PerfectMirror(Material):
+class PerfectMirror(Boundary):
     """R = 1."""
 
     def __init__(self, name: str = "none (R = 1)") -> None:
@@ -148,7 +148,7 @@ class PerfectMirror(Material):
         return self.name
 
 
-class Dielectric(Material):
+class Dielectric(Boundary):
     """A dielectric of relative index η without absorption, as Mitsuba's `dielectric`, or with dispersion."""
 
     transparent = True
@@ -209,7 +209,7 @@ class Dielectric(Material):
         return f"dielectric, eta = {self.eta}" if self.dispersion is None else f"dielectric, {self.medium}"
 
 
-class SpectralConductor(Material):
+class SpectralConductor(Boundary):
     """A metal whose η + ik is given by two spectra, as in Mitsuba's `conductor`."""
 
     def __init__(self, eta: mi.Texture, k: mi.Texture, outside: float, coat: Coat | None = None) -> None:

@@ -372,7 +372,7 @@ class Grating:
         self, si: mi.SurfaceInteraction3f, cos: mi.Float, active: mi.Bool
     ) -> tuple[mi.UnpolarizedSpectrum, mi.UnpolarizedSpectrum]:
         _, si = self._covered(si)
-        return self.theory.material.r_and_t(si, cos if self.coat is None else self.coat.cos_inside(si, cos), active)
+        return self.theory.boundary.r_and_t(si, cos if self.coat is None else self.coat.cos_inside(si, cos), active)
 
     def sample(
         self,

@@ -9,7 +9,7 @@ import mitsuba as mi
 import numpy as np
 
 from ..errors import RequestError, is_number
-from ..optics.materials import (
+from ..optics.refractive_indices import (
     DISPERSION,
     MAX_INDEX,
     MIN_INDEX,

@@ -53,7 +53,7 @@ class Layers:
         self.coat, self.base = request.coat, request.base
         self.grating = Grating(request)
         flags = mi.BSDFFlags.GlossyReflection | mi.BSDFFlags.Anisotropic | mi.BSDFFlags.FrontSide
-        varying = [*self.grating.scales, self.grating.theory.material]
+        varying = [*self.grating.scales, self.grating.theory.boundary]
         varies = self.grating.orientation.is_spatially_varying() or any(part.varies for part in varying)
         if varies or self.grating.from_radius:
             flags = flags | mi.BSDFFlags.SpatiallyVarying

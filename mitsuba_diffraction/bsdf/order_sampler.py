@@ -70,7 +70,7 @@ class OrderSampler:
 
         Args:
             spectrum: with the wavelengths in the densest medium next to the relief.
-            stack: the material with its films; None without transmission.
+            stack: the media with the films; None without transmission.
             is_sheet: whether there is a flat lower face, with the upper medium below it.
             coat_index: of a layer over the relief, relative to the outside.
             height_scales: factors of the heights, ascending; each interval between two of them has its own bins.

@@ -15,8 +15,8 @@ import numpy as np
 from ..errors import RequestError, is_number
 from ..handed_over_spectra import handed_over
 from ..optics.geometry import SHADOWING
-from ..optics.materials import KnownRange, is_file
 from ..optics.media import Media, MediumBelow
+from ..optics.refractive_indices import KnownRange, is_file
 from ..precomputation.recipe import REQUESTED, Recipe, kind_of, source_named
 from ..precomputation.requested_surface import RequestedSurface
 from ..precomputation.spectra import Spectrum, load_spectrum
@@ -36,7 +36,7 @@ from ..surface.gratings import PROFILES
 from .base import Base, base_from
 from .coat import Coat
 from .device_tables import larger
-from .fresnel import Material, below_from, reflectance_from
+from .fresnel import Boundary, below_from, boundary_from
 from .indices import index_from
 from .mitsuba_internals import nested_plugin
 from .thin_film import with_film
@@ -192,7 +192,7 @@ def surface_from(props: mi.Properties, media: Media, scale: float = 1.0) -> Spec
         if props.get("theory", found) != found:
             raise RequestError(f"theory: got {theory!r} with a spectrum of {found} theory, wanted one built for it")
         return surface
-    settings = {"theory": theory, **_material_settings(props, media)} if theory == "rigorous" else {}
+    settings = {"theory": theory, **_medium_settings(props, media)} if theory == "rigorous" else {}
     return _inside(media, scale, Recipe.of_profile(props["profile"], props, **_requested(props), **settings))
 
 
@@ -268,7 +268,7 @@ def _from_file(props: mi.Properties, media: Media, scale: float) -> Spectrum | R
     )
 
 
-def _material_settings(props: mi.Properties, media: Media) -> dict[str, Any]:
+def _medium_settings(props: mi.Properties, media: Media) -> dict[str, Any]:
     """Return `material` or `int_ior` for `precompute`, the index relative to the outside.
 
     Raises:
@@ -350,7 +350,7 @@ def check_rigorous(spectrum: RigorousSpectrum, request: GratingRequest) -> None:
     if not spectrum.is_of(MediumBelow.requested(stated)):
         got = " ".join(f"{name} {value}" for name, value in stated.items())
         raise RequestError(
-            f"material: got {got}, but the rigorous spectrum is of {spectrum.material_name}: "
+            f"material: got {got}, but the rigorous spectrum is of {spectrum.medium_text}: "
             "leave it out, or build the spectrum for this material"
         )
 
@@ -366,7 +366,7 @@ class GratingRequest:
         scale: the maximum of both, for which a recipe in `surface` is made.
         orientation: degrees from the tangent to the pattern's x axis.
         from_radius: whether they are from the radius, away from the centre of the surface, instead.
-        material: R of scalar theory.
+        boundary: R and T of a plane, for scalar theory.
         stated: `material` or `int_ior` of the scene, as settings of a rigorous spectrum; None in scalar theory, and if
             the scene leaves them to the spectrum.
         base: below the grating, or None.
@@ -381,7 +381,7 @@ class GratingRequest:
     scale: float
     orientation: mi.Texture
     from_radius: bool
-    material: Material
+    boundary: Boundary
     stated: dict[str, Any] | None
     base: Base | None
     shadowing: bool
@@ -391,7 +391,7 @@ class GratingRequest:
     @property
     def known_ranges(self) -> tuple[KnownRange, ...]:
         """Where each index that the scene names is known."""
-        return *self.media.known_ranges, *self.material.known_ranges(), *self._known_of_recipe
+        return *self.media.known_ranges, *self.boundary.known_ranges(), *self._known_of_recipe
 
     @cached_property
     def _known_of_recipe(self) -> tuple[KnownRange, ...]:
@@ -432,16 +432,16 @@ class GratingRequest:
             orientation = props.get_texture("orientation", 0.0)
         check_texture("orientation", orientation)
         coat = Coat.of(media)
-        bare = reflectance_from(props, media, coat)
+        bare = boundary_from(props, media, coat)
         scale, stated = scales.max_scale, None
         surface = surface_from(props, media, scale)
         if _theory_of(surface) == "rigorous":
             _refuse_scalar_only(props)
             # With a coat, `ext_ior` is the index above the coat.
             if any(name in props for name in ("material", "int_ior", *(["ext_ior"] if media.coat is None else []))):
-                stated = _material_settings(props, media)
-        material, base = with_film(props, bare), base_from(props)
-        if base is not None and not material.transparent:
+                stated = _medium_settings(props, media)
+        boundary, base = with_film(props, bare), base_from(props)
+        if base is not None and not boundary.transparent:
             raise RequestError("base: got a BSDF below a conductor or a perfect mirror, which transmit no light")
         shadowing = props.get("shadowing", SHADOWING[0])
         if shadowing not in SHADOWING:
@@ -456,7 +456,7 @@ class GratingRequest:
             scale=scale,
             orientation=orientation,
             from_radius=from_radius,
-            material=material,
+            boundary=boundary,
             stated=stated,
             base=base,
             shadowing=shadowing == "v_cavity",

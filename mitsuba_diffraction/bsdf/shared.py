@@ -49,7 +49,7 @@ class SharedTables:
 
     Attributes:
         table: the powers and their sampler. For resolved orders there is no sampler here, as it depends on the scene.
-        stack: the material and its films, if light is transmitted.
+        stack: the media and the films, if light is transmitted.
         max_scale: the maximum lateral scale for which orders are resolved; None if they overlap without scaling.
     """
 
@@ -71,7 +71,7 @@ class SharedTables:
     def of(cls, spectrum: GratingSpectrum, stack: Stack | None = None) -> SharedTables:
         """Return the tables that a BSDF with an equal spectrum holds, or else new ones.
 
-        `stack` is the material of a grating that transmits light, with its films.
+        `stack` has the media of a grating that transmits light, with its films.
         """
         return shared((mi.variant(), spectrum.digest, stack), lambda: cls(spectrum, stack))
 

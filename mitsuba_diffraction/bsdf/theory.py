@@ -25,7 +25,7 @@ from .coat import Coat
 from .device_tables import opaque
 from .directions import Geometry, Incidence, Interface, rotated
 from .energy_factor import Coordinates, Energy
-from .fresnel import Material, PerfectMirror
+from .fresnel import Boundary, PerfectMirror
 from .order_sampler import MAX_INDEX_CHANGE, OrderSampler
 from .parameters import GratingRequest, check_rigorous
 from .polarisation import Split, of_facets, of_orders
@@ -104,7 +104,7 @@ class Theory(Protocol):
 
     Attributes:
         scattering: the powers, and their sampler.
-        material: R of a plane.
+        boundary: R and T of a plane.
         interface: the media above and below.
         media: those around the grating.
         shadowing: whether G is a factor.
@@ -114,7 +114,7 @@ class Theory(Protocol):
     """
 
     scattering: Scattering
-    material: Material
+    boundary: Boundary
     interface: Interface
     media: Media
     shadowing: bool
@@ -130,7 +130,7 @@ class Theory(Protocol):
         """
 
     def traverse(self, callback: mi.TraversalCallback) -> None:
-        """Show the parameters of the theory and of its material; none by default."""
+        """Show the parameters of the theory and of its boundary; none by default."""
         return
 
     def parameters_changed(self, keys: list[str]) -> None:
@@ -195,7 +195,7 @@ class ScalarTheory(Theory):
         _check_error(spectrum)
         self.spectrum, self.media, self.scales = spectrum, request.media, request.scales
         self.coat = request.coat
-        self.material, self.shadowing = request.material, request.shadowing
+        self.boundary, self.shadowing = request.boundary, request.shadowing
         self.conserve_energy, self.largest_angle = request.conserve_energy, spectrum.largest_angle
         self.update()
 
@@ -235,7 +235,7 @@ class ScalarTheory(Theory):
         self.wavelengths, self.light = (shortest * index, longest * index), light
         if light and self.spectrum.waves is not None:
             outside = self.media.outside if self.media.transmits else index
-            error = self.spectrum.waves.error(light, outside, transparent=self.material.transparent)
+            error = self.spectrum.waves.error(light, outside, transparent=self.boundary.transparent)
             if error.warning:
                 _warn(self.spectrum.source, error.warning)
 
@@ -247,8 +247,8 @@ class ScalarTheory(Theory):
         return stack.max_difference(before) > MAX_FILM_CHANGE
 
     def _stack(self) -> Stack | None:
-        """Return the material and its films for E and for samplers, if light is transmitted."""
-        return self.material.stack(self.media.eta) if self.media.transmits else None
+        """Return the media and the films for E and for samplers, if light is transmitted."""
+        return self.boundary.stack(self.media.eta) if self.media.transmits else None
 
     def _interface(self) -> Interface:
         """Return the media above and below, and set the sampler of orders for the current scales and index."""
@@ -259,18 +259,18 @@ class ScalarTheory(Theory):
         kappas = tuple(opaque(kappa) for kappa in small_kappas(self.spectrum, self.media.eta, self.scales.laterals[0]))
         sampler = scattering.sampler
         fraction = sampler.transmitted_fraction if isinstance(sampler, OrderSampler) else None
-        dispersions = None, self.material.dispersion
-        return Interface(1.0, self.material.eta, is_sheet, False, kappas, fraction, dispersions)
+        dispersions = None, self.boundary.dispersion
+        return Interface(1.0, self.boundary.eta, is_sheet, False, kappas, fraction, dispersions)
 
     def parameters_changed(self, keys: list[str]) -> None:
         changed = [scale for scale in self.scales if not keys or scale.name in keys]
         for scale in changed:
             scale.read()
-        self.material.update()
+        self.boundary.update()
         other_index = False
         if self.media.transmits:
             # Tables are reused for nearly the same index, for the speed of scenes in which it varies smoothly.
-            eta, before = float(np.max(dr.detach(self.material.eta))), self.media.eta
+            eta, before = float(np.max(dr.detach(self.boundary.eta))), self.media.eta
             if not 0 < eta < np.inf or abs(eta - 1) < SAME_INDEX:
                 raise RequestError(
                     f"eta: got {eta:g}, wanted a positive relative index other than one, as light is transmitted"
@@ -286,7 +286,7 @@ class ScalarTheory(Theory):
     def traverse(self, callback: mi.TraversalCallback) -> None:
         for scale in self.scales:
             scale.put(callback)
-        self.material.traverse(callback)
+        self.boundary.traverse(callback)
 
     def coordinates(self, geometry: Geometry) -> tuple[Coordinates, Coordinates] | None:
         if self.energy is None:
@@ -304,7 +304,7 @@ class ScalarTheory(Theory):
         return power, density
 
     def reflectance(self, si: mi.SurfaceInteraction3f, geometry: Geometry, active: mi.Bool) -> mi.UnpolarizedSpectrum:
-        return dr.select(geometry.reflects, *self.material.r_and_t(si, geometry.cos_half(), active))
+        return dr.select(geometry.reflects, *self.boundary.r_and_t(si, geometry.cos_half(), active))
 
     def split(
         self,
@@ -314,7 +314,7 @@ class ScalarTheory(Theory):
         active: mi.Bool,
     ) -> Split:
         def planes(cos_half: mi.Float, reflects: mi.Bool) -> list[mi.Matrix4f]:
-            return self.material.planes(si, cos_half, reflects, active)
+            return self.boundary.planes(si, cos_half, reflects, active)
 
         return of_facets(value, planes, self.interface.eta)
 
@@ -323,7 +323,7 @@ class ScalarTheory(Theory):
         if self.energy is not None:
             energy = "bounds the albedo by about one"
         lines = {
-            "reflectance": self.material,
+            "reflectance": self.boundary,
             **{scale.name: scale for scale in self.scales},
             "shadowing": SHADOWING[0 if self.shadowing else 1],
             "energy": energy,
@@ -340,7 +340,7 @@ class RigorousTheory(Theory):
     def __init__(self, spectrum: RigorousSpectrum, request: GratingRequest) -> None:
         check_rigorous(spectrum, request)
         self.media = media = request.media
-        self.material = PerfectMirror(f"{spectrum.material_name}, in the efficiencies")
+        self.boundary = PerfectMirror(f"{spectrum.medium_text}, in the efficiencies")
         self.scattering = shared((mi.variant(), spectrum.digest), lambda: RigorousOrders(spectrum))
         if not media.transmits:
             self.interface = _of_coat(request.coat)
@@ -388,4 +388,4 @@ class RigorousTheory(Theory):
         return of_orders(value, entries, mi.Vector3f(-sin, cos, 0))
 
     def __str__(self) -> str:
-        return f"reflectance = {self.material}"
+        return f"reflectance = {self.boundary}"

@@ -18,9 +18,9 @@ import numpy as np
 
 from ..errors import RequestError, is_number
 from ..optics import film_stack
-from ..optics.materials import KnownRange, RefractiveIndex, is_file
+from ..optics.refractive_indices import KnownRange, RefractiveIndex, is_file
 from .device_tables import integer_part, larger, opaque
-from .fresnel import Cosines, Material, PerfectMirror
+from .fresnel import Boundary, Cosines, PerfectMirror
 from .indices import Dispersion, index_from
 from .varying import VaryingNumber, number_or_text
 
@@ -122,20 +122,20 @@ def _crossed(
     return [film_stack.across_film(field, y, u, v) for field, y in zip(fields, (z, z / (n * n)), strict=True)], across
 
 
-def with_film(props: mi.Properties, material: Material) -> Material:
-    """Return the material with the films of `thin_film_thickness` and `thin_film_ior`, if there are any.
+def with_film(props: mi.Properties, bare: Boundary) -> Boundary:
+    """Return the boundary with the films of `thin_film_thickness` and `thin_film_ior`, if there are any.
 
     Raises:
-        RequestError: if a parameter is wrong, or the material cannot have a film.
+        RequestError: if a parameter is wrong, or the medium below cannot have a film.
     """
     given = [name for name in ("thin_film_thickness", "thin_film_ior") if name in props]
     if not given:
         if "thin_film_scale" in props:
             raise RequestError("thin_film_scale: got it alone, wanted thin_film_thickness and thin_film_ior with it")
-        return material
+        return bare
     if len(given) == 1:
         raise RequestError(f"{given[0]}: got it alone, wanted thin_film_thickness and thin_film_ior together")
-    if isinstance(material, PerfectMirror):
+    if isinstance(bare, PerfectMirror):
         raise RequestError("thin_film_thickness: got a film on material=none, wanted a dielectric or a conductor")
     iors, thickness = props["thin_film_ior"], props["thin_film_thickness"]
     indices = list_entries("thin_film_ior", iors) if isinstance(iors, str) else [iors]
@@ -143,7 +143,7 @@ def with_film(props: mi.Properties, material: Material) -> Material:
     scale = VaryingNumber("thin_film_scale", props.get("thin_film_scale", 1.0))
     if len(media) > 1 or (isinstance(thickness, str) and _is_list(thickness)):
         thickness = _thicknesses(thickness, len(media))
-    return FilmedMaterial(material, media, VaryingNumber("thin_film_thickness", thickness), scale)
+    return FilmedBoundary(bare, media, VaryingNumber("thin_film_thickness", thickness), scale)
 
 
 def _thicknesses(given: Any, count: int) -> list[float]:
@@ -213,11 +213,11 @@ def _leading_file(text: str) -> re.Match[str] | None:
     return None
 
 
-class FilmedMaterial(Material):
+class FilmedBoundary(Boundary):
     """A dielectric or a conductor under films.
 
     Attributes:
-        below: the material.
+        below: the boundary without the films.
         films: the indices, absolute, from the outside in.
         thickness: of one film, a number or a texture; of several, as many numbers, µm.
         scale: the factor of the thicknesses.
@@ -225,7 +225,7 @@ class FilmedMaterial(Material):
     """
 
     def __init__(
-        self, below: Material, films: list[RefractiveIndex], thickness: VaryingNumber, scale: VaryingNumber
+        self, below: Boundary, films: list[RefractiveIndex], thickness: VaryingNumber, scale: VaryingNumber
     ) -> None:
         self.below, self.films, self.thickness, self.scale = below, films, thickness, scale
         self.outside, self.coat = below.outside, below.coat

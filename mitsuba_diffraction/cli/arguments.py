@@ -119,16 +119,16 @@ def angles_of(option: str, text: str) -> NDArray[np.float64]:
     return found
 
 
-def materials_of(texts: Sequence[str] | None) -> dict[str, dict[str, Any]]:
+def replacements_of(texts: Sequence[str] | None) -> dict[str, dict[str, Any]]:
     """Return the parameters of the gratings that replace BSDFs, by id, from the options --material ID=…."""
-    materials: dict[str, dict[str, Any]] = {}
+    replacements: dict[str, dict[str, Any]] = {}
     for text in texts or []:
         name, equals, rest = text.partition("=")
         if not (name and equals and rest.partition(",")[0]):
             raise RequestError(f"--material: got {text!r}, wanted ID=SURFACE[,name=value…]")
         requested = RequestedSurface.of(rest)
         source, values = requested.source, dict(requested.values)
-        if name in materials:
+        if name in replacements:
             raise RequestError(f"--material {name}: got it twice, wanted one grating")
         if requested.kind == "scan":
             raise RequestError(
@@ -143,5 +143,5 @@ def materials_of(texts: Sequence[str] | None) -> dict[str, dict[str, Any]]:
             values["transmission"] = "sheet"
             say("note", f"material {name}: {source} transmits light (transmission=sheet); transmission=none does not")
         # Absolute, as file names in a scene are relative to the folder of the scene.
-        materials[name] = {**({"filename": os.path.abspath(source)} if is_file else {"profile": source}), **values}
-    return materials
+        replacements[name] = {**({"filename": os.path.abspath(source)} if is_file else {"profile": source}), **values}
+    return replacements

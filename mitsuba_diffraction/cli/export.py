@@ -37,7 +37,7 @@ from .arguments import (
 )
 
 _OPTIONS = {"wavelengths": "--wavelength", "angles": "--angle", "azimuths": "--azimuth", "azimuth": "--azimuth"}
-_OF_MATERIAL = ("theory", "material", "int_ior")
+_OF_MEDIUM = ("theory", "material", "int_ior")
 _INPUTS = {"orientation": "Orientation", "height_scale": "HeightScale", "base": "BaseColor"}  # of the shader
 _IN_SCENES = ("coat_ior", "thin_film_ior", "thin_film_thickness", "transmission", "ext_ior", "lateral_scale", *_INPUTS)
 _SHADERS = {".osl": write_shader, ".npz": write_node_tables}
@@ -87,7 +87,7 @@ def export(
     if surface is None:
         _write_extension(output, overwrite)
         return
-    requested = RequestedSurface.of(surface, aside=(*_OF_MATERIAL, *_IN_SCENES))
+    requested = RequestedSurface.of(surface, aside=(*_OF_MEDIUM, *_IN_SCENES))
     check_suffix("-o", output, _COLOURS, *_SHADERS, *_RANGES)
     ranges = {"wavelength": wavelength, "angle": angle, "azimuth": azimuth}
     given = {key: text for key, text in ranges.items() if text is not None}

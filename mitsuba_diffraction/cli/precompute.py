@@ -11,7 +11,7 @@ from ..errors import RequestError, is_number
 from ..files.outputs import check_outputs
 from ..precomputation.recipe import Recipe
 from ..precomputation.requested_surface import RequestedSurface
-from ..precomputation.spectra import check_material
+from ..precomputation.spectra import check_index_range
 from ..precomputation.surface_text import converted
 from ..progress import bytes_text, durations, progress_bar, stage, tell
 from .arguments import KEYS_OF_RECIPES, SURFACE, Overwrite, check_suffix
@@ -76,7 +76,7 @@ def _check_pixel_size(recipe: Recipe) -> None:
 def _precompute(request: RequestedSurface, target: Path, verbose: bool) -> None:
     """Compute, save and report one spectrum."""
     recipe = request.recipe
-    check_material(recipe.settings)
+    check_index_range(recipe.settings)
     with progress_bar(f"spectrum of {request.path.name}", "%") as progress:
         spectrum = recipe.build(progress)
         with stage("writing"):

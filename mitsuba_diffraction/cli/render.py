@@ -24,8 +24,8 @@ from .arguments import (
     Variant,
     as_command,
     check_suffix,
-    materials_of,
     named_as_options,
+    replacements_of,
     scene_parameters,
 )
 
@@ -163,7 +163,7 @@ class RenderRequest:
         from ..render.scene_file import SceneFile
 
         size = self.width, self.height
-        scene_file = SceneFile(self.scene, self._parameters()[0], materials_of(self.material), size)
+        scene_file = SceneFile(self.scene, self._parameters()[0], replacements_of(self.material), size)
         if self.frames is None:
             return [scene_file]
         frames = frames_of(scene_file, self.frames)
@@ -222,7 +222,7 @@ def render(request: RenderRequest) -> None:
 
     import mitsuba as mi
 
-    from ..render.scene_materials import check_materials
+    from ..render.replacements import check_replacements
     from ..variants import choose_variant
 
     scene_files = request.scene_files()
@@ -231,7 +231,7 @@ def render(request: RenderRequest) -> None:
     denoise = request.denoises()
     arguments = _arguments(request, scene_files[0], target)
     with scene_files[-1].parsed():  # before all others are rendered
-        check_materials(scene_files[-1].materials)
+        check_replacements(scene_files[-1].replacements)
     _render_all(_Rendering(request, arguments, denoise, shown), scene_files, target)
 
 

@@ -222,7 +222,7 @@ def efficiencies(
         theory: "scalar" or "rigorous".
         material: a conductor by Mitsuba's name, "Al", or a file; or "none", the perfect mirror R = 1, in scalar theory.
         int_ior: or an index of refraction, n + ik, the name of a medium with dispersion, "BK7", or a file
-            (`materials.index_of`); 1.5 if neither is given, as in a scene.
+            (`refractive_indices.index_of`); 1.5 if neither is given, as in a scene.
         transmission: "none": reflected orders; "interface": orders transmitted into the dielectric; "sheet": orders
             transmitted by a film with a flat lower face, n_o = 1, in rigorous theory with all internal reflections.
         azimuth: of the plane of incidence, degrees from the x axis; 90: along the grooves (conical incidence).

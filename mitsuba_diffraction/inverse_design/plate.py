@@ -10,7 +10,7 @@ from numpy.typing import ArrayLike
 
 from ..array_types import Real
 from ..errors import RequestError, check_whole, is_number
-from ..optics.materials import MAX_CLEAR_K, index_of
+from ..optics.refractive_indices import MAX_CLEAR_K, index_of
 from ..settings import MIN_WAVELENGTH, VISIBLE
 from .far_field import blurred_texels
 

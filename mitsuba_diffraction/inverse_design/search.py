@@ -70,7 +70,7 @@ def design(
         angle: from the mirror direction to the middle of an edge of the picture, degrees.
         wavelengths: nm, one number for a laser; by default white light, 430–670 nm.
         int_ior: index of a sheet that transmits the light, which falls on its relief: a number, the name of a medium
-            with dispersion, or a file (`materials.index_of`); by default the relief reflects.
+            with dispersion, or a file (`refractive_indices.index_of`); by default the relief reflects.
         levels: number of equidistant heights; by default they are continuous.
         seen_on: "wall": seen from the side of the plate; "screen": a translucent one, seen from the other side.
         unused: where light goes that the colours of the target cannot use: "outside" of the frame, or in "mirror"

@@ -25,7 +25,7 @@ from numpy.typing import NDArray
 
 from ..array_types import Real
 from .geometry import AnyArray
-from .materials import NOMINAL_WAVELENGTH, RefractiveIndex
+from .refractive_indices import NOMINAL_WAVELENGTH, RefractiveIndex
 
 Plane = Callable[[Real], tuple[Real, Real]]
 """R and T of unpolarised light at the cosines of the angles of incidence."""

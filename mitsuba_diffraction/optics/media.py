@@ -11,7 +11,7 @@ import numpy as np
 
 from ..errors import RequestError
 from ..settings import TRANSMISSIONS, VISIBLE
-from .materials import KnownRange, RefractiveIndex, constant, index_of, is_file
+from .refractive_indices import KnownRange, RefractiveIndex, constant, index_of, is_file
 
 DEFAULT_INT_IOR = 1.5
 """Index of the dielectric below a relief by default."""

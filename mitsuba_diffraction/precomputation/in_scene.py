@@ -7,8 +7,8 @@ from dataclasses import dataclass
 from typing import Any
 
 from ..errors import RequestError, did_you_mean, is_number
-from ..optics.materials import constant
 from ..optics.media import DEFAULT_INT_IOR, Media, MediumBelow
+from ..optics.refractive_indices import constant
 from ..settings import FROM_RADIUS
 from .recipe import Recipe
 

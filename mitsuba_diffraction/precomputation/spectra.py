@@ -59,7 +59,7 @@ def precompute(
     patches = (height_field,) if isinstance(height_field, HeightField) else tuple(height_field)
     if not all(isinstance(patch, HeightField) for patch in patches):
         raise RequestError(f"height_field: got {type(height_field).__name__}, wanted a HeightField or several")
-    check_material(request)
+    check_index_range(request)
     spectrum = build_spectrum(patches, request, progress)
     for concern in spectrum.concerns:
         warnings.warn(concern, stacklevel=2)
@@ -121,8 +121,8 @@ def check_height_range(height_field: HeightField, settings: Settings) -> None:
         )
 
 
-def check_material(settings: Settings) -> None:
-    """Check that the index of a rigorous table is known at all its wavelengths: a scene does not know its material.
+def check_index_range(settings: Settings) -> None:
+    """Check that the index of a rigorous table is known at all its wavelengths, which a scene does not ask again.
 
     Raises:
         RequestError: if it is not.

@@ -37,7 +37,7 @@ def frames_of(scene_file: SceneFile, count: int) -> list[SceneFile]:
     Raises:
         RequestError: if a text has two vectors of different lengths.
     """
-    values = [scene_file.parameters, *scene_file.materials.values()]
+    values = [scene_file.parameters, *scene_file.replacements.values()]
     if not any(_ends(value) for table in values for value in table.values()):
         return [scene_file] * count  # parsed once
     at = [k / (count - 1) for k in range(count)]
@@ -45,9 +45,9 @@ def frames_of(scene_file: SceneFile, count: int) -> list[SceneFile]:
         replace(
             scene_file,
             parameters={name: str(_between(v, fraction)) for name, v in scene_file.parameters.items()},
-            materials={
+            replacements={
                 bsdf: {name: _between(v, fraction) for name, v in grating.items()}
-                for bsdf, grating in scene_file.materials.items()
+                for bsdf, grating in scene_file.replacements.items()
             },
         )
         for fraction in at

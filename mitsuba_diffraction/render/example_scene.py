@@ -12,7 +12,7 @@ from ..precomputation.spectra import Spectrum
 from ..surface.gratings import PROFILES
 
 LAMP_HEIGHT, CAMERA_HEIGHT = 1.6, 4.2  # above the centre of a disc of radius one
-_OF_MATERIAL = ("material", "int_ior", "eta")
+_OF_MEDIUM = ("material", "int_ior", "eta")
 
 
 def example_scene(
@@ -40,7 +40,7 @@ def example_scene(
     if isinstance(surface, (str, os.PathLike)):
         surface = os.fspath(surface)
         kind = "profile" if surface in PROFILES else "filename"
-    if not any(name in parameters for name in _OF_MATERIAL):
+    if not any(name in parameters for name in _OF_MEDIUM):
         parameters["material"] = "Al"
     to_world = mi.ScalarTransform4f().look_at(origin=[0, 0, CAMERA_HEIGHT], target=[0, 0, 0], up=[0, 1, 0])
     return {

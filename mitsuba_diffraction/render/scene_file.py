@@ -29,10 +29,10 @@ from ..precomputation.recipe import Recipe, source_named
 from ..progress import progress_bar
 from ..variants import is_supported
 from .parser_state import children_of, resolved_file
+from .replacements import Replacements, check_replacements, replace_bsdfs, warn_of_unused_replacements
 from .scene import instantiated, move_first_sensor, replace_path, unwrap_integrators
 from .scene_light import draw_wavelengths_of_lights
 from .scene_limits import check_depth, check_nesting
-from .scene_materials import Materials, check_materials, replace_materials, warn_of_unused_materials
 from .scene_numbers import read_numbers
 from .spectral_film import replace_films
 
@@ -48,7 +48,7 @@ class SceneFile:
     Attributes:
         path: of the XML file. File names in it are relative to its folder.
         parameters: values for its `$name` parameters (`-Dname=value` of Mitsuba's command line).
-        materials: id of a BSDF → parameters of the `diffraction_grating` that replaces it. Of a BSDF that holds others
+        replacements: id of a BSDF → parameters of the grating that replaces it. Of a BSDF that holds others
             (`twosided`, `mask`, `normalmap`, `bumpmap`, `blendbsdf`), these are replaced; only a `twosided` around a
             grating that transmits light is removed. Below a dielectric of scalar theory the BSDF remains as `base`,
             unless that is given; "none" stands for none.
@@ -65,7 +65,7 @@ class SceneFile:
 
     path: str | os.PathLike[str]
     parameters: Mapping[str, str] = field(default_factory=dict)
-    materials: Materials = field(default_factory=dict)
+    replacements: Replacements = field(default_factory=dict)
     size: tuple[int | None, int | None] = (None, None)
     motion: tuple[float, ...] | None = None
 
@@ -110,9 +110,9 @@ class SceneFile:
             resolved = mi.parser.ParserState(state)
             mi.parser.transform_resolve(config, resolved)
             check_depth(resolved)
-            if self.materials:
+            if self.replacements:
                 mi.parser.transform_resolve(config, state)
-                replace_materials(state, self.materials)
+                replace_bsdfs(state, self.replacements)
             _refuse_missing_files(path, state)
         return path.read_bytes(), state, folders
 
@@ -212,9 +212,9 @@ class SceneFile:
         if not is_supported(mi.variant()):
             raise RequestError(f"variant: got {mi.variant()!r}, wanted a spectral one, such as 'llvm_ad_spectral'")
         with self.parsed() as (config, state):
-            if self.materials:
-                check_materials(self.materials)
-                warn_of_unused_materials(state, self.materials)
+            if self.replacements:
+                check_replacements(self.replacements)
+                warn_of_unused_replacements(state, self.replacements)
             replace_films(state, *self.size)
             unwrap_integrators(state)
             replace_path(state)

@@ -139,7 +139,7 @@ def build_rigorous(
                 values=values,
                 mueller=mueller,
                 settings=stored,
-                material_digest=surface.below.digest if name else "",
+                index_digest=surface.below.digest if name else "",
                 harmonics=surface.harmonics,
                 source=height_field.source,
                 source_digest=height_field.digest,

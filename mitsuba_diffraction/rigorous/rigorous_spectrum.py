@@ -20,8 +20,8 @@ from numpy.typing import ArrayLike, NDArray
 
 from ..array_types import Real
 from ..errors import RequestError, check_whole
-from ..optics.materials import MAX_INDEX
 from ..optics.media import MediumBelow
+from ..optics.refractive_indices import MAX_INDEX
 from ..settings import RigorousSettings, lobe_cutoff, lobe_width
 from ..spectrum.exr import MALFORMED, doubles, one_line, read_channels, write_channels
 from ..spectrum.grids import OrderGrid
@@ -39,7 +39,7 @@ _NUMBERS = {
     "max_error_near": "worstNear",
     "polarisation_error": "polarisationError",
 }
-_TEXTS = {"material_digest": "materialDigest", "source": "source", "source_digest": "sourceDigest"}
+_TEXTS = {"index_digest": "materialDigest", "source": "source", "source_digest": "sourceDigest"}
 _STEPS = ("stepsF", "stepsX", "stepsZ")
 
 
@@ -278,7 +278,7 @@ class RigorousSpectrum:
             so that all are smooth at k_y = 0.
         settings: the parameters it was built with. The tolerance is a number; a medium with a name is `material`, and a
             file is named without its folder.
-        material_digest: SHA-256 of the index of the material; empty for an index that is a number.
+        index_digest: SHA-256 of the index below; empty for an index that is a number.
         error: the mean of Σ|Δη_m| / Σ η_m, measured at directions (uniform over the hemisphere) and wavelengths that
             were not used to build the table. Sums are over all outgoing orders, above and below; with transmission,
             light is incident from above and from below.
@@ -300,7 +300,7 @@ class RigorousSpectrum:
     harmonics: int
     source: str
     source_digest: str = field(repr=False)
-    material_digest: str = field(default="", repr=False)
+    index_digest: str = field(default="", repr=False)
     polarisation_error: float = float("nan")
 
     def __post_init__(self) -> None:
@@ -362,7 +362,7 @@ class RigorousSpectrum:
     @property
     def summary(self) -> str:
         """The material and the error."""
-        return f"{self.material_name}, rigorous theory; mean error {self.error:.1e} (tolerance {self.tolerance:.3g})"
+        return f"{self.medium_text}, rigorous theory; mean error {self.error:.1e} (tolerance {self.tolerance:.3g})"
 
     @property
     def details(self) -> str:
@@ -383,8 +383,8 @@ class RigorousSpectrum:
         return OrderGrid((self.axes.period, self.axes.period), (self.axes.max_order, 0))
 
     @property
-    def material_name(self) -> str:
-        """The material as recipes and scenes specify it."""
+    def medium_text(self) -> str:
+        """The medium below, and above, as recipes and scenes specify them."""
         above = self.settings.ext_ior
         medium = "" if above == 1 else f" below ext_ior {above:.6g}"
         if self.settings.material:
@@ -398,7 +398,7 @@ class RigorousSpectrum:
             return False
         if below.index.is_constant:
             return abs(below.index.nominal - self.int_ior) < 1e-3 * abs(self.int_ior)
-        return below.index.digest == self.material_digest
+        return below.index.digest == self.index_digest
 
     @property
     def megabytes(self) -> float:

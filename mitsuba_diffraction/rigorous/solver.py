@@ -16,7 +16,7 @@ from threadpoolctl import ThreadpoolController
 from ..array_types import Complex, Real
 from ..errors import RequestError
 from ..optics.geometry import Orders
-from ..optics.materials import refractive_index
+from ..optics.refractive_indices import refractive_index
 from ..surface.heightfield import HeightField
 from .coordinate_transformation import ABOVE, BELOW, Curve, CurveMatrices, Scattered, curve_of, half_space, scatter
 

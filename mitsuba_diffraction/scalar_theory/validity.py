@@ -49,11 +49,11 @@ def equivalent_depth(rms_height: float) -> float:
 
 
 @functools.cache
-def error_map(material: str = "dielectric") -> tuple[Real, Real, Real, Real]:
+def error_map(case: str = "dielectric") -> tuple[Real, Real, Real, Real]:
     """Return the error of scalar theory for sinusoids in unpolarised light (`tools/data/scalar_theory_map.py`).
 
     Args:
-        material: "dielectric", n = 1.5, or "Al", aluminium at 550 nm; "transmitted" and "transmitted from below": the
+        case: "dielectric", n = 1.5, or "Al", aluminium at 550 nm; "transmitted" and "transmitted from below": the
             transmission of the dielectric, with directions in air.
 
     Returns:
@@ -61,17 +61,17 @@ def error_map(material: str = "dielectric") -> tuple[Real, Real, Real, Real]:
         incidence and the azimuth of its plane, 0 if perpendicular to the grooves.
     """
     content = json.loads(MAP.read_text(encoding="utf-8"))
-    if material not in content["error"]:
-        raise RequestError(f"material: got {material!r}, wanted one of {', '.join(content['error'])}")
+    if case not in content["error"]:
+        raise RequestError(f"case: got {case!r}, wanted one of {', '.join(content['error'])}")
     periods, depths, directions = (np.array(content[name], float) for name in ("periods", "depths", "directions"))
-    errors = np.reshape(content["error"][material], (len(directions), len(depths), len(periods)))
+    errors = np.reshape(content["error"][case], (len(directions), len(depths), len(periods)))
     return periods, depths, directions, errors.transpose(2, 1, 0)
 
 
 @functools.cache
-def _logarithms(material: str, largest_angle: float, mean: bool) -> tuple[Real, Real, Real]:
+def _logarithms(case: str, largest_angle: float, mean: bool) -> tuple[Real, Real, Real]:
     """Return ln(period/λ) (n,), ln(depth/λ) (k,), and the logarithm of the error over directions, (k, n)."""
-    periods, depths, directions, errors = error_map(material)
+    periods, depths, directions, errors = error_map(case)
     errors = errors[..., directions[:, 0] <= largest_angle]
     error = errors.mean(axis=2) if mean else errors.max(axis=2)
     return np.log(periods), np.log(depths), np.log(np.maximum(error.T, 1e-6))
@@ -82,7 +82,7 @@ def expected_error(
     depth: float,
     wavelength: float,
     *,
-    material: str = "dielectric",
+    case: str = "dielectric",
     largest_angle: float = 20.0,
     mean: bool = False,
 ) -> float:
@@ -96,7 +96,7 @@ def expected_error(
         period: µm.
         depth: peak to valley, µm.
         wavelength: µm.
-        material: see `error_map`.
+        case: see `error_map`.
         largest_angle: degrees.
         mean: of these errors instead of the largest.
 
@@ -106,7 +106,7 @@ def expected_error(
         which are not stored and outside the range of scalar theory.
 
     Raises:
-        ValueError: unless period and wavelength are positive and the depth is not negative, or for another material.
+        ValueError: unless period and wavelength are positive and the depth is not negative, or for another case.
     """
     for name, value in (("period", period), ("wavelength", wavelength)):
         if not (np.isfinite(value) and value > 0):
@@ -115,11 +115,11 @@ def expected_error(
         raise RequestError(f"depth: got {depth!r}, wanted a number in µm, zero or more")
     if not largest_angle >= 0:
         raise RequestError(f"largest_angle: got {largest_angle!r}, wanted degrees, zero or more")
-    periods, depths, _, _ = error_map(material)
+    periods, depths, _, _ = error_map(case)
     if period < periods[0] * wavelength or depth > depths[-1] * wavelength:
         return float("nan")
     # Outside, `np.interp` takes the value at the boundary.
-    at, across, errors = _logarithms(material, float(largest_angle), mean)
+    at, across, errors = _logarithms(case, float(largest_angle), mean)
     of_depths = [np.interp(np.log(period / wavelength), at, error) for error in errors]
     return float(np.exp(np.interp(np.log(max(depth / wavelength, depths[0])), across, of_depths)))
 
@@ -221,14 +221,14 @@ class Waves:
         reflected, transmitted = (self._estimated(name, inside) for name in ("dielectric", "transmitted"))
         return ScalarError(reflected, transmitted, True, remedy, wavelengths)
 
-    def _estimated(self, material: str, wavelengths: Sequence[float]) -> float:
+    def _estimated(self, case: str, wavelengths: Sequence[float]) -> float:
         """Return the mean error over wavelengths in µm; infinite for too large a depth."""
         if self.depth == 0:
             return 0.0
         nodes, total = error_map()[0], 0.0
         for wavelength in wavelengths:
             depth = self.depth / wavelength
-            errors = [expected_error(node, depth, 1.0, material=material, mean=True) for node in nodes]
+            errors = [expected_error(node, depth, 1.0, case=case, mean=True) for node in nodes]
             if not np.isfinite(errors).all():
                 return float("inf")
             of_waves = np.interp(np.log(np.divide(self.periods, wavelength)), np.log(nodes), np.log(errors))

@@ -129,8 +129,8 @@ def define() -> type:
             settings = dict(self.settings, shadowing=layers.grating.theory.shadowing)
             if self.variant != "gem":
                 settings["corrected_coherence_length"] = float(recipe.settings.coherence_length)
-                material = layers.grating.theory.material
-                settings["exact_fresnel"] = isinstance(material, Dielectric)
+                boundary = layers.grating.theory.boundary
+                settings["exact_fresnel"] = isinstance(boundary, Dielectric)
                 settings["extent"] = recipe.settings.extent
                 settings["max_height_scale"] = float(layers.grating.scales.height.values[-1])
             shader = VARIANTS[self.variant](recipe.height_field(), self.quirks, **settings)
@@ -235,4 +235,4 @@ def parameters_of_variant(variant: str) -> tuple[str, ...]:
 
 def _normal_reflectance(layers: Layers) -> NDArray[np.float64]:
     """Return R at normal incidence at `tristimulus.wavelengths`, (401,)."""
-    return sampled_spectrum(lambda si: layers.grating.theory.material(si, mi.Float(1), mi.Bool(True)))
+    return sampled_spectrum(lambda si: layers.grating.theory.boundary(si, mi.Float(1), mi.Bool(True)))

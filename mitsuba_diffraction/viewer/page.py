@@ -16,8 +16,8 @@ from numpy.typing import NDArray
 from ..errors import RequestError
 from ..files.outputs import MARK
 from ..optics.color import observer
-from ..optics.materials import conductor
 from ..optics.media import DEFAULT_INT_IOR, MediumBelow
+from ..optics.refractive_indices import conductor
 from ..precomputation.in_scene import AIR, DISCS
 from ..settings import FROM_RADIUS, SUN_COHERENCE_LENGTH, VISIBLE
 from ..spectrum.grids import OrderGrid
@@ -132,7 +132,7 @@ def _data(surface: Surface, picture: NDArray[np.float16] | None) -> dict[str, An
         "grating": dict(surface.grating),
         "integers": [name for name, value in surface.grating.items() if isinstance(value, int)],
         "command": surface.command,
-        "material": _material(surface),
+        "inScene": _in_scene(surface),
         "spectrum": _spectrum(surface),
         "metals": _metals(surface.in_scene.media.below),
         "light": encoded(_light()),
@@ -166,7 +166,7 @@ def _profile(surface: Surface) -> str:
     return "" if surface.recipe is None else str(surface.recipe.surface.get("profile"))
 
 
-def _material(surface: Surface) -> dict[str, Any]:
+def _in_scene(surface: Surface) -> dict[str, Any]:
     shown = surface.in_scene
     orientation, below = shown.orientation, shown.media.below
     return {

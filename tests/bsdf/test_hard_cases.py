@@ -13,7 +13,7 @@ from test_bsdf import evaluate, k_g, random_directions, raw_plugin, towards
 import mitsuba_diffraction as md
 from mitsuba_diffraction.bsdf.indices import Dispersion
 from mitsuba_diffraction.optics.geometry import horizon_gain
-from mitsuba_diffraction.optics.materials import index_of
+from mitsuba_diffraction.optics.refractive_indices import index_of
 from mitsuba_diffraction.settings import lobe_width
 from mitsuba_diffraction.spectrum.grids import OrderGrid
 

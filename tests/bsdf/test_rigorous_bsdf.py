@@ -12,7 +12,7 @@ from bsdf_support import check_chi_square, direction, evaluate, interaction, mad
 import mitsuba_diffraction as md
 from mitsuba_diffraction.bsdf import testing
 from mitsuba_diffraction.optics.geometry import fresnel, horizon_gain
-from mitsuba_diffraction.optics.materials import index_of
+from mitsuba_diffraction.optics.refractive_indices import index_of
 from mitsuba_diffraction.rigorous.rigorous_spectrum import RigorousSpectrum
 from mitsuba_diffraction.rigorous.solver import mueller
 from mitsuba_diffraction.settings import RigorousSettings
@@ -197,9 +197,7 @@ def test_a_table_is_of_the_index_in_a_file_wherever_that_lies(llvm, tmp_path):
     table = tmp_path / "first" / "metal.spd"
     table.write_text("300 0.5 3\n900 0.6 4\n")
     settings = RigorousSettings(material="metal.spd", tolerance=0.01)
-    spectrum = dataclasses.replace(
-        made_up(), settings=settings, material_digest=index_of("material", str(table)).digest
-    )
+    spectrum = dataclasses.replace(made_up(), settings=settings, index_digest=index_of("material", str(table)).digest)
     spectrum.save(tmp_path / "first" / "table.exr")
     moved = (tmp_path / "first").rename(tmp_path / "second")
     scene = {"type": "diffraction_grating", "filename": str(moved / "table.exr"), "material": str(moved / "metal.spd")}
@@ -439,7 +437,7 @@ def test_precompute_writes_a_recipes_rigorous_spectrum(command, tmp_path):
     assert code == 0
     assert "int_ior 1.5, rigorous theory" in out
     saved = RigorousSpectrum.load(target)
-    assert (saved.material_name, saved.mueller) == ("int_ior 1.5", None)
+    assert (saved.medium_text, saved.mueller) == ("int_ior 1.5", None)
     # Values stand in for the recipe's.
     scalar = tmp_path / "scalar.toml"
     scalar.write_text('[surface]\nprofile = "sinusoidal"\nperiod = 0.19\ndepth = 0.05\nsamples = 32\n')

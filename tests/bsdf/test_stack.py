@@ -10,7 +10,7 @@ from test_thin_film import load, material_of, pairs, powers
 
 from mitsuba_diffraction import testing
 from mitsuba_diffraction.optics import film_stack
-from mitsuba_diffraction.optics.materials import constant, index_of, refractive_index
+from mitsuba_diffraction.optics.refractive_indices import constant, index_of, refractive_index
 
 WAVELENGTHS = (420.0, 500.0, 580.0, 660.0)
 STACK = {"thin_film_ior": "3 x (2.35, 1.38)", "thin_film_thickness": "3 x (0.06, 0.1)"}

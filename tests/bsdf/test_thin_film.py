@@ -21,7 +21,7 @@ from bsdf_support import (
 )
 
 import mitsuba_diffraction as md
-from mitsuba_diffraction.optics.materials import refractive_index
+from mitsuba_diffraction.optics.refractive_indices import refractive_index
 
 WAVELENGTHS = np.linspace(400, 800, 9)
 ANGLES = np.arange(0.0, 81.0, 10)
@@ -66,7 +66,7 @@ def load(**parameters):
 
 
 def material_of(bsdf):
-    return bsdf.layers.grating.theory.material
+    return bsdf.layers.grating.theory.boundary
 
 
 def powers(bsdf, cosines, wavelengths):
@@ -253,7 +253,7 @@ def test_the_bounds_of_a_thickness_are_those_of_its_products(llvm, thickness, sc
     given = {name: bitmap([of]) if kinds[name] == "texture" else of[0] for name, of in values.items()}
     film = {"thin_film_ior": 2.35, "thin_film_thickness": given["thickness"], "thin_film_scale": given["scale"]}
     bsdf = load(int_ior=1.5, **film)
-    (found,), bounds = bsdf.layers.grating.theory.material.thicknesses()
+    (found,), bounds = bsdf.layers.grating.theory.boundary.thicknesses()
     used = [of if kinds[name] == "texture" else of[:1] for name, of in values.items()]
     products = [a * b for a, b in itertools.product(*used)]
     np.testing.assert_allclose([found * bound for bound in bounds], [min(products), max(products)], rtol=1e-6)

@@ -17,7 +17,7 @@ from mitsuba_diffraction.bsdf.device_tables import on_device
 from mitsuba_diffraction.bsdf.directions import Geometry, Incidence, Interface
 from mitsuba_diffraction.bsdf.order_sampler import OrderSampler
 from mitsuba_diffraction.optics.film_stack import Stack
-from mitsuba_diffraction.optics.materials import RefractiveIndex, constant
+from mitsuba_diffraction.optics.refractive_indices import RefractiveIndex, constant
 
 PERIOD, ETA, WAVELENGTH = 3.35, 1.5, 0.5
 IMPORTANCE = mi.TransportMode.Importance

@@ -392,7 +392,7 @@ def test_a_bug_is_reported_as_such(command, monkeypatch):
 
 def test_a_bug_inside_a_plugin_is_not_blamed_on_the_scene(command, monkeypatch):
     Path("scene.xml").write_text(SCENE)
-    monkeypatch.setattr("mitsuba_diffraction.bsdf.parameters.reflectance_from", broadcast)
+    monkeypatch.setattr("mitsuba_diffraction.bsdf.parameters.boundary_from", broadcast)
     code, _, err = command("render scene.xml --spp 1 -o out.exr")
     assert code == 1
     assert len(err.splitlines()) == 1, err

@@ -11,7 +11,7 @@ import mitsuba_diffraction as md
 from mitsuba_diffraction.energy.furnace import Furnace, bounds_of, mean_cosine
 from mitsuba_diffraction.optics.film_stack import Stack
 from mitsuba_diffraction.optics.geometry import horizon_gain, k_g
-from mitsuba_diffraction.optics.materials import constant
+from mitsuba_diffraction.optics.refractive_indices import constant
 
 INDEX, SHORT, LONG = 1.5, 360.0, 830.0
 GLASS, NORMAL = Stack(1.0, constant(INDEX)), ((INDEX - 1) / (INDEX + 1)) ** 2

@@ -31,7 +31,7 @@ from PIL import Image
 from mitsuba_diffraction.errors import is_bug
 from mitsuba_diffraction.files.picture_file import read_picture
 from mitsuba_diffraction.files.writing import UNSEALED, seal
-from mitsuba_diffraction.optics.materials import read_index
+from mitsuba_diffraction.optics.refractive_indices import read_index
 from mitsuba_diffraction.precomputation.recipe import Recipe
 from mitsuba_diffraction.precomputation.requested_surface import RequestedSurface
 from mitsuba_diffraction.precomputation.spectra import load_spectrum, precompute

@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from mitsuba_diffraction.optics.materials import DISPERSION, index_of, read_index, refractive_index
+from mitsuba_diffraction.optics.refractive_indices import DISPERSION, index_of, read_index, refractive_index
 
 PUBLISHED = [
     # name, µm, n, within; sources beside them

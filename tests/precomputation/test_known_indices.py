@@ -3,7 +3,7 @@
 import pytest
 
 from mitsuba_diffraction.errors import RequestError
-from mitsuba_diffraction.precomputation.spectra import check_material
+from mitsuba_diffraction.precomputation.spectra import check_index_range
 from mitsuba_diffraction.precomputation.surface_text import parsed
 from mitsuba_diffraction.settings import Settings
 
@@ -15,7 +15,7 @@ def test_an_index_must_be_known_at_the_wavelengths_in_air(ext_ior, tmp_path):
 
     def check(first, last):
         wavelengths = first / ext_ior, last / ext_ior
-        check_material(Settings.of(theory="rigorous", material=str(table), ext_ior=ext_ior, wavelengths=wavelengths))
+        check_index_range(Settings.of(theory="rigorous", material=str(table), ext_ior=ext_ior, wavelengths=wavelengths))
 
     check(401, 699)
     for outside in ((380, 699), (401, 730)):

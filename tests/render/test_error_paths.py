@@ -58,7 +58,7 @@ def test_requests_that_cannot_be_met(llvm, tmp_path, monkeypatch):
     path = write_scene(tmp_path, CONSTANT + GLASS)
     one_line("width: got 0, wanted a positive number of pixels", lambda: SceneFile(path, size=(0, None)).load())
     grating = {"glass": {"profile": "blazed", "period": 2.5, "depth": 0.25}}
-    one_line("in the place of a BSDF that transmits light", lambda: SceneFile(path, materials=grating).load())
+    one_line("in the place of a BSDF that transmits light", lambda: SceneFile(path, replacements=grating).load())
     one_line("spp: got 0, wanted a positive number", lambda: render(path, spp=0))
     one_line("wanted at most .* for so large a picture", lambda: split(SceneFile(path).load(), 10**14))
     monkeypatch.setattr(trace_pass, "available_memory", lambda: 1000)

@@ -751,11 +751,11 @@ def test_values_run_from_the_first_to_the_last_frame():
     frames = frames_of(SceneFile("scene.xml", scene, {"g": grating}), 5)
     assert [frame.parameters["red"] for frame in frames] == ["1", "0.75", "0.5", "0.25", "0"]
     assert [frame.parameters["lamp"] for frame in frames[::2]] == ["2, -1, 2", "0, -1, 3", "-2, -1, 4"]
-    assert [frame.materials["g"]["period"] for frame in frames] == [2, 2.25, 2.5, 2.75, 3]
+    assert [frame.replacements["g"]["period"] for frame in frames] == [2, 2.25, 2.5, 2.75, 3]
     rest = {name: scene[name] for name in ("lines", "name", "spp")}
     for frame in frames:
         assert rest.items() <= frame.parameters.items()
-        assert frame.materials["g"] == {**grating, "period": frame.materials["g"]["period"]}
+        assert frame.replacements["g"] == {**grating, "period": frame.replacements["g"]["period"]}
 
 
 def test_a_lamp_moves_and_an_interrupted_film_of_it_resumes(command, monkeypatch):
@@ -792,7 +792,7 @@ def test_a_grating_and_the_camera_change_at_once(command):
     code, _, err = command(f"{line} --material g=sinusoidal,{text},depth=0.1:0.3")
     assert code == 0, err
     motion = orbit(SceneFile("scene.xml"), 3)[1]
-    still = render(SceneFile("scene.xml", materials={"g": {**grating, "depth": 0.2}}, motion=motion), spp=1).radiance
+    still = render(SceneFile("scene.xml", replacements={"g": {**grating, "depth": 0.2}}, motion=motion), spp=1).radiance
     np.testing.assert_array_equal(SpectralImage.load("out_001.exr").radiance, still)
 
 

@@ -221,8 +221,8 @@ def test_a_disc_opens_under_plastic_with_its_tracks_round_the_centre(source, com
         code, _, error = command(f"view {request}{given} --no-open -o disc.html")
         assert code == 0, error
         data = json.loads(re.search(r'<script id="data".*?>(.*?)</script>', Path("disc.html").read_text())[1])
-        material = data["material"]
-        assert tuple(material[name] for name in ("material", "coat_ior", "from_radius", "orientation")) == wanted
+        shown = data["inScene"]
+        assert tuple(shown[name] for name in ("material", "coat_ior", "from_radius", "orientation")) == wanted
         assert data["shape"] == "disc"
         # From the hole of 15 mm to the edge of 120 mm, tracks from about 46 to 117 mm.
         hole, first, last = data["rings"]
@@ -246,7 +246,7 @@ def test_several_surfaces_are_a_list_in_one_page(command, tmp_path, monkeypatch)
         json.loads(data) for data in re.findall(r'<script id="data\d*" type="application/json">(.*)</script>', text)
     ]
     assert [data["name"] for data in found] == ["blazed", "lamellar", "scan"]
-    assert [data["material"]["material"] for data in found] == ["Al", "", ""]
+    assert [data["inScene"]["material"] for data in found] == ["Al", "", ""]
     code, _, error = command("view blazed blazed --no-open")
     assert (code, error.partition("error: ")[2]) == (2, "surfaces: got blazed, blazed, wanted each name once\n")
     # Variants of one surface are named by their values.
@@ -273,8 +273,8 @@ def test_a_page_asks_what_the_medium_below_is(tmp_path):
         return json.loads(re.search('<script id="data" type="application/json">(.*)</script>', text)[1])
 
     metal = data(material=str(tmp_path / "metal.csv"))
-    assert metal["material"]["material"] == "metal.csv"
+    assert metal["inScene"]["material"] == "metal.csv"
     assert "metal.csv" in metal["metals"]
     glass = data(material="BK7")
-    assert glass["material"]["material"] == ""
-    assert glass["material"]["int_ior"] == pytest.approx(1.5187, abs=1e-4)  # of the data sheet at 546 nm
+    assert glass["inScene"]["material"] == ""
+    assert glass["inScene"]["int_ior"] == pytest.approx(1.5187, abs=1e-4)  # of the data sheet at 546 nm

@@ -14,7 +14,7 @@ from pathlib import Path
 
 import yaml
 
-from mitsuba_diffraction.optics.materials import read_index
+from mitsuba_diffraction.optics.refractive_indices import read_index
 
 BAND = 0.4, 0.7  # µm
 

@@ -16,10 +16,10 @@ const shapeOf = (data) => (data.shape === "coil" && !data.coil ? "sphere" : data
 function firstView(data) {
   if (shapeOf(data) === "coil") {
     return { azimuth: -60, elevation: 38, distance: 4.6, lightAzimuth: -20, lightElevation: 40,
-      lightWidth: 8, lightLength: 0, sky: 0.05, hasBase: data.material.material === "", pigment: "#100c0a",
+      lightWidth: 8, lightLength: 0, sky: 0.05, hasBase: data.inScene.material === "", pigment: "#100c0a",
       scales: data.scales };
   }
-  const isDielectric = data.material.material === "";
+  const isDielectric = data.inScene.material === "";
   if (shapeOf(data) === "wall") {
     return { azimuth: -90, elevation: 50, distance: 5.2, lightAzimuth: -90, lightElevation: 70,
       lightWidth: 0.5, lightLength: 0, sky: 0, hasBase: false, pigment: "#141a22" };
@@ -34,16 +34,16 @@ function firstView(data) {
 }
 
 function initialState(data) {
-  const { material, spectrum } = data;
+  const { inScene, spectrum } = data;
   return {
     shape: shapeOf(data), scales: "none", ...firstView(data), exposure: 0,
-    orientation: material.orientation,
-    fromRadius: material.from_radius,
-    heightScale: material.height_scale,
-    coat: material.coat_ior, air: material.air,
+    orientation: inScene.orientation,
+    fromRadius: inScene.from_radius,
+    heightScale: inScene.height_scale,
+    coat: inScene.coat_ior, air: inScene.air,
     coherenceLength: spectrum.coherence_length,
-    material: material.material === "" ? "dielectric" : material.material,
-    index: material.int_ior,
+    material: inScene.material === "" ? "dielectric" : inScene.material,
+    index: inScene.int_ior,
     right: "none", divider: 0.5, difference: false,
     quirks: allQuirks(true), terms: 37, brightness: PUBLISHED_BRIGHTNESS,
     maxFrames: MAX_FRAMES,
@@ -61,11 +61,11 @@ function prepareControls(data, number) {
   for (const [value, text] of options) $("material").add(new Option(text, value));
   if (shapeOf(data) !== "wall") $("shape").querySelector("[value=wall]").remove();
   // The coil's tangents follow its body.
-  if (!data.coil || data.material.from_radius) $("shape").querySelector("[value=coil]").remove();
-  $("orientation").disabled = data.material.from_radius;
-  $("heightScale").max = data.material.max_height_scale;
-  $("coat").max = data.material.coat_ior;
-  $("coat").closest(".row").hidden = data.material.coat_ior === 1;
+  if (!data.coil || data.inScene.from_radius) $("shape").querySelector("[value=coil]").remove();
+  $("orientation").disabled = data.inScene.from_radius;
+  $("heightScale").max = data.inScene.max_height_scale;
+  $("coat").max = data.inScene.coat_ior;
+  $("coat").closest(".row").hidden = data.inScene.coat_ior === 1;
   const [shortest, longest] = coherenceLengths(spectrum);
   Object.assign($("coherenceLength"), { min: Math.log(shortest), max: Math.log(longest), step: "any" });
   $("coherenceLength").disabled = shortest === longest;

@@ -16,7 +16,7 @@ from .parser_state import add_child, children_of, resolved_file
 _log = logging.getLogger(__name__)
 
 
-Materials = Mapping[str, Mapping[str, bool | float | str]]
+Replacements = Mapping[str, Mapping[str, bool | float | str]]
 """Id of a BSDF → parameters of the grating that replaces it."""
 
 
@@ -24,16 +24,16 @@ Materials = Mapping[str, Mapping[str, bool | float | str]]
 _TRANSMITTING = {"dielectric", "roughdielectric", "thindielectric", "principledthin", "null"}
 
 
-def check_materials(materials: Materials) -> None:
+def check_replacements(replacements: Replacements) -> None:
     """Raise RequestError if a parameter of a grating is wrong, before a spectrum is computed for any of them."""
-    for name, values in materials.items():
+    for name, values in replacements.items():
         try:
             check(_grating(values))
         except RequestError as error:
             raise RequestError(f"material {name}: {error}") from None
 
 
-def warn_of_unused_materials(state: mi.parser.ParserState, materials: Materials) -> None:
+def warn_of_unused_replacements(state: mi.parser.ParserState, replacements: Replacements) -> None:
     """Log a warning for each grating that replaces a BSDF to which nothing in the scene refers."""
     # Follow references from all objects of the scene except its BSDFs.
     waiting = [k for k in children_of(state, state.root.props).values() if state.nodes[k].type != mi.ObjectType.BSDF]
@@ -41,15 +41,15 @@ def warn_of_unused_materials(state: mi.parser.ParserState, materials: Materials)
     while waiting:
         used.add(node := waiting.pop())
         waiting += [child for child in children_of(state, state.nodes[node].props).values() if child not in used]
-    for name in materials:
+    for name in replacements:
         if state.id_to_index[name] not in used:
             _log.warning("material %s: no shape uses the BSDF with that id, so the picture is unaffected", name)
 
 
-def replace_materials(state: mi.parser.ParserState, materials: Materials) -> None:
+def replace_bsdfs(state: mi.parser.ParserState, replacements: Replacements) -> None:
     """Replace BSDFs by gratings; see `SceneFile`."""
     bsdfs = {node.props.id(): k for k, node in enumerate(state.nodes) if node.type == mi.ObjectType.BSDF}
-    for name, values in materials.items():
+    for name, values in replacements.items():
         if name not in bsdfs:
             known = ", ".join(sorted(filter(None, bsdfs))) or "none: its BSDFs have no ids"
             raise RequestError(f"material: got the id {name!r}, the ids of BSDFs in the scene are {known}")

@@ -11,7 +11,7 @@ import pytest
 from bsdf_support import made_up
 
 from mitsuba_diffraction.bsdf.mitsuba_internals import has_uvs
-from mitsuba_diffraction.cli.arguments import materials_of
+from mitsuba_diffraction.cli.arguments import replacements_of
 from mitsuba_diffraction.render import render
 from mitsuba_diffraction.render.scene import warn_of_gratings
 from mitsuba_diffraction.render.scene_file import SceneFile
@@ -83,9 +83,9 @@ def exported(llvm, tmp_path):
     return write
 
 
-def test_a_replaced_material_renders_as_if_the_scene_had_the_grating(exported):
+def test_a_replaced_bsdf_renders_as_if_the_scene_had_the_grating(exported):
     wanted = render(exported(GRATING), spp=2).radiance
-    found = render(SceneFile(path := exported(), materials={"mat-Disc": MIRROR}), spp=2).radiance
+    found = render(SceneFile(path := exported(), replacements={"mat-Disc": MIRROR}), spp=2).radiance
     np.testing.assert_array_equal(found, wanted)
     before = render(path, spp=2).radiance
     assert np.abs(found - before).max() > 0.1
@@ -123,9 +123,9 @@ def tree(state, node):
     return props.plugin_name(), {key: str(x) if "Color" in type(x).__name__ else x for key, x in values.items()}
 
 
-def parsed_disc(path, materials=None):
+def parsed_disc(path, replacements=None):
     """The BSDF of the disc of an exported scene as it is parsed, see `tree`."""
-    with SceneFile(path, materials=materials).parsed() as (config, state):
+    with SceneFile(path, replacements=replacements).parsed() as (config, state):
         mi.parser.transform_resolve(config, state)
         (disc,) = [node for node in state.nodes if node.props.id() == "mat-Disc"]
         return tree(state, disc)
@@ -148,7 +148,7 @@ def test_the_grating_is_put_inside_of_what_wraps_a_material(exported, wrapper, v
     part = '<ref id="shared"/>' if referenced else pigment
     path.write_text(before.replace("BSDF", text.replace("PART", part) + shared))
     assert parsed_disc(path, {"mat-Disc": values}) == wanted
-    with SceneFile(path, materials={"mat-Disc": values}).parsed() as (_, state):
+    with SceneFile(path, replacements={"mat-Disc": values}).parsed() as (_, state):
         (kept,) = [node.props for node in state.nodes if node.props.id() == "shared"]
         assert kept.plugin_name() == "diffuse"
 
@@ -164,7 +164,7 @@ def test_a_grating_that_transmits_light_is_on_no_side_of_a_mask(exported):
     )
     assert plugins.count("twosided") == 0
     assert {"mask", "normalmap", "diffraction_grating"} <= set(plugins)
-    SceneFile(path, materials={"mat-Disc": glass}).load()
+    SceneFile(path, replacements={"mat-Disc": glass}).load()
 
 
 def test_the_opacity_of_a_masked_material_remains(exported):
@@ -175,7 +175,7 @@ def test_the_opacity_of_a_masked_material_remains(exported):
     for opacity in (1, 0.3):
         mask = f'<bsdf type="mask" id="mat-Disc"><float name="opacity" value="{opacity}"/><bsdf type="diffuse"/></bsdf>'
         path.write_text(text.replace(DISC, mask))
-        image = render(SceneFile(path, materials={"mat-Disc": MIRROR}, size=(16, None)), spp=1024)
+        image = render(SceneFile(path, replacements={"mat-Disc": MIRROR}, size=(16, None)), spp=1024)
         means.append(image.radiance[4:8, 6:10].mean())
     # The standard error of 0.3 of 16384 samples is 1.2 %.
     assert means[1] == pytest.approx(0.3 * means[0], rel=0.05)
@@ -184,9 +184,9 @@ def test_the_opacity_of_a_masked_material_remains(exported):
 def test_the_replaced_bsdf_remains_below_a_dielectric(exported):
     below = PLAIN.replace('<string name="material" value="none"/>', PRINCIPLED.replace('bsdf"', 'base"', 1))
     wanted = render(exported(f'<bsdf type="diffraction_grating" name="bsdf">{below}</bsdf>'), spp=2).radiance
-    found = render(SceneFile(path := exported(), materials={"mat-Disc": DIELECTRIC}), spp=2).radiance
+    found = render(SceneFile(path := exported(), replacements={"mat-Disc": DIELECTRIC}), spp=2).radiance
     np.testing.assert_array_equal(found, wanted)
-    bare = render(SceneFile(path, materials={"mat-Disc": {**DIELECTRIC, "base": "none"}}), spp=2).radiance
+    bare = render(SceneFile(path, replacements={"mat-Disc": {**DIELECTRIC, "base": "none"}}), spp=2).radiance
     assert found.mean() > 2 * bare.mean()
 
 
@@ -210,7 +210,7 @@ def test_a_base_remains_where_light_reaches_it(exported, tmp_path, values, kept)
         text = f'[surface]\nprofile = "blazed"\n[spectrum]\ntheory = "{theory}"\nint_ior = 1.5\n'
         (tmp_path / f"{theory}.toml").write_text(text if theory == "rigorous" else text.replace("int_ior = 1.5\n", ""))
     made_up().save(tmp_path / "rigorous.exr")
-    with SceneFile(path, materials={"mat-Disc": {"profile": "blazed", **values}}).parsed() as (_, state):
+    with SceneFile(path, replacements={"mat-Disc": {"profile": "blazed", **values}}).parsed() as (_, state):
         (grating,) = [node.props for node in state.nodes if node.props.plugin_name() == "diffraction_grating"]
         assert ("base" in grating) == kept
 
@@ -227,9 +227,9 @@ def test_a_dielectric_in_the_place_of_glass_is_refused(exported, glass):
     path = exported()
     path.write_text(path.read_text().replace("</scene>", glass.replace("<bsdf ", '<bsdf id="glass" ', 1) + "</scene>"))
     with pytest.raises(ValueError, match=r"material glass: got a dielectric .* wanted transmission=sheet or interface"):
-        SceneFile(path, materials={"glass": {"profile": "blazed"}}).load()
+        SceneFile(path, replacements={"glass": {"profile": "blazed"}}).load()
     for values in ({"transmission": "sheet"}, {"material": "Al"}, {"base": "none"}):
-        with SceneFile(path, materials={"glass": {"profile": "blazed", **values}}).parsed():
+        with SceneFile(path, replacements={"glass": {"profile": "blazed", **values}}).parsed():
             pass
 
 
@@ -247,12 +247,12 @@ def test_diffraction_path_replaces_path_where_it_can(exported, parameter, border
     text = path.read_text().replace('<boolean name="hide_emitters" value="true"/>', parameter)
     path.write_text(text.replace(film, film + border))
 
-    def integrator(**materials):
-        found = SceneFile(path, **materials).load().integrator()
+    def integrator(**replacements):
+        found = SceneFile(path, **replacements).load().integrator()
         return f"{type(found).__name__} {found}"
 
     assert wanted in integrator()
-    assert wanted in integrator(materials={"mat-Disc": MIRROR})
+    assert wanted in integrator(replacements={"mat-Disc": MIRROR})
 
 
 @pytest.mark.parametrize(
@@ -264,8 +264,8 @@ def test_diffraction_path_replaces_path_where_it_can(exported, parameter, border
     ],
     ids=["twosided", "in a twosided", "in a blend"],
 )
-def test_a_material_is_replaced_wherever_it_is(exported, disc, name, kept):
-    shapes = SceneFile(exported(disc), materials={name: MIRROR}).load().shapes()
+def test_a_bsdf_is_replaced_wherever_it_is(exported, disc, name, kept):
+    shapes = SceneFile(exported(disc), replacements={name: MIRROR}).load().shapes()
     (grating,) = [text for text in (str(shape.bsdf()) for shape in shapes) if "DiffractionGrating[" in text]
     assert kept in grating
 
@@ -273,13 +273,13 @@ def test_a_material_is_replaced_wherever_it_is(exported, disc, name, kept):
 def test_a_transmitting_grating_replaces_a_twosided(exported):
     glass = {**MIRROR, "transmission": "interface", "int_ior": 1.5}
     del glass["material"]
-    scene = SceneFile(exported(), materials={"mat-Disc": glass}).load()
+    scene = SceneFile(exported(), replacements={"mat-Disc": glass}).load()
     assert any(str(shape.bsdf()).startswith("DiffractionGrating[") for shape in scene.shapes())
 
 
 def test_an_unknown_id_is_refused_with_the_known_ids(exported):
     with pytest.raises(ValueError, match=r"got the id 'Disc', the ids of BSDFs in the scene are mat-Disc, mat-Floor"):
-        SceneFile(exported(), materials={"Disc": MIRROR}).load()
+        SceneFile(exported(), replacements={"Disc": MIRROR}).load()
 
 
 @pytest.mark.parametrize(
@@ -302,14 +302,14 @@ def test_wrong_parameters_are_refused_before_a_spectrum_is_computed(exported, mo
         "mitsuba_diffraction.precomputation.recipe.Recipe.cached", lambda *_: pytest.fail("a spectrum was computed")
     )
     with pytest.raises((ValueError, FileNotFoundError), match=text):
-        SceneFile(exported(), materials={"mat-Floor": MIRROR, "mat-Disc": values}).load()
+        SceneFile(exported(), replacements={"mat-Floor": MIRROR, "mat-Disc": values}).load()
 
 
-def test_a_material_that_no_shape_has_is_logged(exported, caplog):
+def test_a_replacement_that_no_shape_has_is_logged(exported, caplog):
     path = exported()
     path.write_text(path.read_text().replace("</scene>", '<bsdf type="diffuse" id="mat-Spare"/></scene>'))
     with caplog.at_level(logging.WARNING, "mitsuba_diffraction"):
-        SceneFile(path, materials={"mat-Disc": MIRROR, "mat-Spare": MIRROR}).load()
+        SceneFile(path, replacements={"mat-Disc": MIRROR, "mat-Spare": MIRROR}).load()
     messages = [record.getMessage() for record in caplog.records if "no shape" in record.getMessage()]
     assert messages == ["material mat-Spare: no shape uses the BSDF with that id, so the picture is unaffected"]
 
@@ -320,13 +320,13 @@ def test_a_misspelt_parameter_is_refused_with_a_material_too(exported):
         path.read_text().replace("</scene>", '<shape type="sphere"><float name="radiu" value="1"/></shape></scene>')
     )
     with pytest.raises(ValueError, match="radiu"):
-        SceneFile(path, materials={"mat-Disc": MIRROR}).load()
+        SceneFile(path, replacements={"mat-Disc": MIRROR}).load()
 
 
 @pytest.mark.parametrize("uvs", [True, False])
 def test_a_grating_on_a_mesh_without_uvs_is_logged(exported, uvs, caplog):
     with caplog.at_level(logging.WARNING, "mitsuba_diffraction"):
-        warn_of_gratings(SceneFile(exported(uvs=uvs), materials={"mat-Disc": MIRROR}).load())
+        warn_of_gratings(SceneFile(exported(uvs=uvs), replacements={"mat-Disc": MIRROR}).load())
     messages = [record.getMessage() for record in caplog.records if "UVs" in record.getMessage()]
     assert len(messages) == (0 if uvs else 1)
     assert all(line.startswith("mat-Disc: on a mesh without UVs") for line in messages)
@@ -360,14 +360,14 @@ def test_uvs_are_found_by_the_name_of_either_mitsuba(name):
     assert has_uvs(SimpleNamespace(**{name: lambda: True}))
 
 
-def test_the_digest_of_a_scene_is_that_of_its_materials(exported):
+def test_the_digest_of_a_scene_is_that_of_its_replacements(exported):
     path = exported()
     other = {**MIRROR, "depth": 0.3}
-    digests = [SceneFile(path, materials=m).digest() for m in (None, {"mat-Disc": MIRROR}, {"mat-Disc": other})]
+    digests = [SceneFile(path, replacements=m).digest() for m in (None, {"mat-Disc": MIRROR}, {"mat-Disc": other})]
     assert len(set(digests)) == 3
 
 
-def test_the_command_replaces_several_materials(exported, command, monkeypatch, tmp_path):
+def test_the_command_replaces_several_bsdfs(exported, command, monkeypatch, tmp_path):
     monkeypatch.chdir(tmp_path)
     exported()
     Path("wall.toml").write_text('[surface]\nprofile = "sinusoidal"\nperiod = 2.0\ndepth = 0.1\n')
@@ -381,17 +381,17 @@ def test_the_command_replaces_several_materials(exported, command, monkeypatch, 
     assert error.count("\n") == 1
 
 
-def test_materials_are_read_from_the_command_line(tmp_path, monkeypatch):
+def test_replacements_are_read_from_the_command_line(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     Path("a.toml").write_text('[surface]\nprofile = "blazed"\n')
     Path("turn.png").touch()
     Path("Al").touch()
-    found = materials_of(["mat-A=a.toml,int_ior=1.5", "B=blazed,period=2,material=Al,conserve_energy=false"])
+    found = replacements_of(["mat-A=a.toml,int_ior=1.5", "B=blazed,period=2,material=Al,conserve_energy=false"])
     assert found == {
         "mat-A": {"filename": str(tmp_path / "a.toml"), "int_ior": 1.5},
         "B": {"profile": "blazed", "period": 2, "material": "Al", "conserve_energy": False},
     }
-    assert materials_of(["A=foil,orientation=turn.png"])["A"]["orientation"] == str(tmp_path / "turn.png")
+    assert replacements_of(["A=foil,orientation=turn.png"])["A"]["orientation"] == str(tmp_path / "turn.png")
     for texts, message in (
         (["mat-A"], "got 'mat-A', wanted ID="),
         (["mat-A="], "got 'mat-A=', wanted ID="),
@@ -400,7 +400,7 @@ def test_materials_are_read_from_the_command_line(tmp_path, monkeypatch):
         (["A=blazed,depth"], "got 'depth', wanted name=value"),
     ):
         with pytest.raises((ValueError, FileNotFoundError), match=message):
-            materials_of(texts)
+            replacements_of(texts)
 
 
 @pytest.mark.parametrize(
@@ -419,7 +419,7 @@ def test_materials_are_read_from_the_command_line(tmp_path, monkeypatch):
 def test_films_transmit_unless_told_otherwise(text, transmission, tmp_path, monkeypatch, capfd):
     monkeypatch.chdir(tmp_path)
     Path("film.toml").write_text('[surface]\nprofile = "film"\n')
-    assert materials_of([f"pane={text}"])["pane"].get("transmission") == transmission
+    assert replacements_of([f"pane={text}"])["pane"].get("transmission") == transmission
     noted = "material pane: " in capfd.readouterr().err
     assert noted == (transmission == "sheet")
 
@@ -427,12 +427,13 @@ def test_films_transmit_unless_told_otherwise(text, transmission, tmp_path, monk
 def test_the_file_of_a_texture_belongs_to_the_scene(exported, tmp_path):
     """It is never written over, and a change of it makes another scene."""
     picture, path = tmp_path / "depth.png", exported()
-    materials = {"mat-Disc": {**MIRROR, "height_scale": str(picture)}}
+    replacements = {"mat-Disc": {**MIRROR, "height_scale": str(picture)}}
     digests = set()
     for value in (50, 100):
         mi.Bitmap(np.full((4, 4), value, np.uint8)).write(str(picture))
-        digests.add(SceneFile(path, materials=materials).digest())
+        digests.add(SceneFile(path, replacements=replacements).digest())
     assert len(digests) == 2
-    assert picture in SceneFile(path, materials=materials).files()
-    (shape,) = [s for s in SceneFile(path, materials=materials).load().shapes() if "DiffractionG" in str(s.bsdf())]
+    assert picture in SceneFile(path, replacements=replacements).files()
+    shapes = SceneFile(path, replacements=replacements).load().shapes()
+    (shape,) = [s for s in shapes if "DiffractionG" in str(s.bsdf())]
     assert "height_scale = 0.392157 to 0.392157" in str(shape.bsdf())
