@@ -37,7 +37,7 @@ from scipy import stats
 
 from mitsuba_diffraction.cli import app
 from mitsuba_diffraction.files.writing import whole_file
-from mitsuba_diffraction.optics.color import into_gamut, spectrum_to_linear_sRGB
+from mitsuba_diffraction.optics.color import into_gamut, radiance_to_linear_sRGB
 from mitsuba_diffraction.render import SpectralImage
 
 ROOT = Path(__file__).parents[1]
@@ -96,7 +96,7 @@ def rendered(words: Sequence[str], seed: int) -> Array:
         with contextlib.redirect_stdout(io.StringIO()), contextlib.redirect_stderr(io.StringIO()):
             app(small(words, seed, target), standalone_mode=False, obj={})
         image = SpectralImage.load(target)
-    return into_gamut(spectrum_to_linear_sRGB(image.radiance, image.wavelengths))
+    return into_gamut(radiance_to_linear_sRGB(image.radiance, image.wavelengths))
 
 
 @dataclass(frozen=True)

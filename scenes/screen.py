@@ -23,7 +23,7 @@ from PIL import Image, ImageDraw, ImageFont
 from scipy import ndimage
 
 from mitsuba_diffraction.files.writing import whole_file
-from mitsuba_diffraction.optics.color import into_gamut, on_screen, spectrum_to_linear_sRGB
+from mitsuba_diffraction.optics.color import into_gamut, on_screen, radiance_to_linear_sRGB
 from mitsuba_diffraction.render import SpectralImage
 
 PHOTOGRAPH = Path(__file__).parents[1] / "precompute" / "measured" / "published" / "elaphe_photograph.jpg"
@@ -97,7 +97,7 @@ def main() -> None:
         shown = picture.convert("RGB")
     photograph = Light.of(colour.cctf_decoding(np.asarray(shown) / 255, function="sRGB"))
     image = SpectralImage.load(arguments.rendering)
-    rendering = Light.of(into_gamut(spectrum_to_linear_sRGB(image.radiance, image.wavelengths)))
+    rendering = Light.of(into_gamut(radiance_to_linear_sRGB(image.radiance, image.wavelengths)))
     step = SCREEN_WIDTH / rendering.rgb.shape[1]
 
     spectrum, rows = photograph.distances(shown.width)

@@ -18,7 +18,7 @@ from .orders import SlicePower
 RIM = 3  # nodes of zero around the table, as many as a spline covers
 
 
-class SplineSpectrum:
+class Continuum:
     """S(q; κ) = Σ_m c_m(κ) B(q/Δ − m)/(Δ_x Δ_y) (`SplineGrid`), and the density from which q is drawn.
 
     An evaluation reads three by three nodes, and one word and one packet for the density.

@@ -14,7 +14,7 @@ from ..optics.media import DEFAULT_INT_IOR, Media, MediumBelow
 from ..optics.refractive_indices import MAX_INDEX, MIN_INDEX, KnownRange, RefractiveIndex, constant, index_of, is_file
 from .coat import Coat
 from .device_tables import opaque
-from .indices import Dispersion, check_spectra, index_from, known_spectrum, nodes_of
+from .indices import Dispersion, check_eta_and_k, index_from, nodes_of, range_of_texture
 from .mitsuba_internals import nested_plugin
 
 Cosines: TypeAlias = "mi.Float | mi.UnpolarizedSpectrum"
@@ -221,8 +221,8 @@ class SpectralConductor(Boundary):
     def update(self) -> None:
         # Here, and not in `known`, which Dr.Jit calls while it records `eval`.
         eta, k = self.textures
-        self._known = known_spectrum("eta", eta), known_spectrum("k", k)
-        check_spectra(eta, k, *self._known)
+        self._known = range_of_texture("eta", eta), range_of_texture("k", k)
+        check_eta_and_k(eta, k, *self._known)
 
     def known_ranges(self) -> tuple[KnownRange, ...]:
         return self._known

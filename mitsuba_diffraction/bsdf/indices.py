@@ -114,18 +114,18 @@ def nodes_of(*media: RefractiveIndex) -> np.ndarray:
     return np.linspace(first, last, min(round(last - first), max_nodes) + 1)
 
 
-def known_spectrum(name: str, texture: mi.Texture) -> KnownRange:
+def range_of_texture(name: str, texture: mi.Texture) -> KnownRange:
     """Return where η or k is known: a spectrum that lists values is black outside of them, others have no end."""
     shortest, longest = 0.0, np.inf
     if "values" in mi.traverse(texture):
         shortest, longest = texture.wavelength_range()
     for part in parts(texture, mi.Texture):
-        low, high = known_spectrum(name, part).wavelengths
+        low, high = range_of_texture(name, part).wavelengths
         shortest, longest = max(shortest, low), min(longest, high)
     return KnownRange(name, "its spectrum", (float(shortest), float(longest)))
 
 
-def check_spectra(eta: mi.Texture, k: mi.Texture, *known: KnownRange) -> None:
+def check_eta_and_k(eta: mi.Texture, k: mi.Texture, *known: KnownRange) -> None:
     """Check η + ik at the pixels of pictures, and at wavelengths 1 nm apart where both are `known`.
 
     Mitsuba's textures take any number when parameters change.

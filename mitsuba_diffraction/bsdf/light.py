@@ -68,12 +68,12 @@ def _emits(emitter: mi.Emitter, low: float, high: float) -> bool:
 
     Samples of wavelengths do not answer this: for some spectra Mitsuba draws samples from a part of their range.
     """
-    spectra = parts(emitter, mi.Texture)
-    if not spectra or any(spectrum.is_spatially_varying() for spectrum in spectra):
+    textures = parts(emitter, mi.Texture)
+    if not textures or any(texture.is_spatially_varying() for texture in textures):
         return low < VISIBLE[1] and high > VISIBLE[0]
     si = _at_wavelengths(low, high)
     rng = mi.PCG32(size=dr.width(si.wavelengths))
-    values = [spectrum.eval(si) for spectrum in spectra]
+    values = [texture.eval(si) for texture in textures]
     if not any(dr.any(value > 0, axis=None) for value in values):
         _, value = emitter.sample_direction(si, mi.Point2f(rng.next_float32(), rng.next_float32()))
         values = [mi.unpolarized_spectrum(value)]

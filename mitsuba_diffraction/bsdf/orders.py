@@ -254,7 +254,7 @@ def _hermite(
 MAX_DRAWN_LOBE_WIDTH = 0.03
 
 
-class OrderSpectrum:
+class ScalarOrders:
     """S(q; κ) = Σ_m η_m(κ) N(q − m/T; σ_q² I), and the density from which q is drawn.
 
     N is truncated as in `OrderGrid.lobes`. If orders are resolved, at most one of them contributes at q, and lobes may
@@ -299,7 +299,7 @@ class OrderSpectrum:
         """The maximum lateral scale for which resolved orders stay so."""
         return min((axis.max_scale for axis in self.axes if axis.max_order), default=np.inf)
 
-    def drawn_by(self, sampler: OrderSampler) -> OrderSpectrum:
+    def drawn_by(self, sampler: OrderSampler) -> ScalarOrders:
         """Return resolved orders with the sampler of a scene, which share the tables."""
         result = copy.copy(self)
         result.sampler = sampler

@@ -16,10 +16,10 @@ from ..optics.film_stack import Stack
 from ..precomputation.grating_spectrum import GratingSpectrum
 from ..settings import VISIBLE
 from ..spectrum.grids import OrderGrid
-from .continuum import SplineSpectrum
+from .continuum import Continuum
 from .energy_factor import Energy
 from .order_sampler import OrderSampler
-from .orders import OrderSpectrum
+from .orders import ScalarOrders
 from .parameters import Scales
 
 MAX_NODE_PHASE_STEP = 0.5  # radians at the deepest point, between nodes of the ratio of scales in a table of E
@@ -57,14 +57,14 @@ class SharedTables:
         # Above κ of nearly all transmitted light: 1.5 times κ of undiffracted light along the normal, at the shortest
         # visible wavelength.
         max_kappa = None if stack is None else 3 * np.pi * abs(stack.nominal - 1) / (VISIBLE[0] * 1e-3)
-        kind = OrderSpectrum if isinstance(spectrum.grid, OrderGrid) else SplineSpectrum
-        self.table: OrderSpectrum | SplineSpectrum = kind(spectrum, max_kappa)
+        kind = ScalarOrders if isinstance(spectrum.grid, OrderGrid) else Continuum
+        self.table: ScalarOrders | Continuum = kind(spectrum, max_kappa)
         self.max_scale: float | None = None
-        if isinstance(self.table, OrderSpectrum) and self.table.resolved:
+        if isinstance(self.table, ScalarOrders) and self.table.resolved:
             self.max_scale = self.table.max_scale
         self._spectrum, self.stack = spectrum, stack
         self._energy: tuple[tuple, Energy | None] | None = None
-        self._drawn: tuple[tuple, OrderSpectrum] | None = None
+        self._drawn: tuple[tuple, ScalarOrders] | None = None
         self._lock = threading.Lock()
 
     @classmethod
@@ -75,7 +75,7 @@ class SharedTables:
         """
         return shared((mi.variant(), spectrum.digest, stack), lambda: cls(spectrum, stack))
 
-    def scattering(self, scales: Scales, is_sheet: bool, coat_index: float) -> OrderSpectrum | SplineSpectrum:
+    def scattering(self, scales: Scales, is_sheet: bool, coat_index: float) -> ScalarOrders | Continuum:
         """Return the powers of scalar theory and their sampler, for the media and scales of a scene."""
         if not self.table.resolved:
             return self.table
@@ -85,7 +85,7 @@ class SharedTables:
         with self._lock:
             if self._drawn is None or self._drawn[0] != key:
                 sampler = OrderSampler(self._spectrum, self.stack, *key)
-                self._drawn = key, cast(OrderSpectrum, self.table).drawn_by(sampler)
+                self._drawn = key, cast(ScalarOrders, self.table).drawn_by(sampler)
             return self._drawn[1]
 
     def energy(self, scales: Scales) -> Energy | None:

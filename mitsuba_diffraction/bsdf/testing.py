@@ -112,7 +112,7 @@ def evaluate_pdf(
     context = context or mi.BSDFContext()
     value, pdf = bsdf.eval_pdf(context, interaction(wi, wavelengths, uv), vectors(wo))
     dr.eval(value, pdf)  # in one kernel
-    value, pdf = _spectrum(value, len(wo)), array(pdf, np.float64)
+    value, pdf = _rows(value, len(wo)), array(pdf, np.float64)
     value = value.reshape(*shape, groups.size)[..., :count]
     return value, np.broadcast_to(pdf, len(wo)).reshape(*shape, len(groups))
 
@@ -149,7 +149,7 @@ def sample(
         context or mi.BSDFContext(), interaction(wi, wavelengths, uv), floats(u[0]), mi.Point2f(*map(floats, u[1:]))
     )
     dr.eval(found, weight)  # in one kernel
-    return array(found.wo, np.float64).T, _spectrum(weight, count), found
+    return array(found.wo, np.float64).T, _rows(weight, count), found
 
 
 def _components(kind: type, values: ArrayLike) -> object:
@@ -162,7 +162,7 @@ def _channels() -> int:
     return len(mi.UnpolarizedSpectrum(0))
 
 
-def _spectrum(value: mi.Spectrum, count: int) -> Real:
+def _rows(value: mi.Spectrum, count: int) -> Real:
     """Convert a spectrum of Mitsuba, or the first element of a Mueller matrix: (count, c)."""
     found = array(mi.unpolarized_spectrum(value), np.float64).reshape(_channels(), -1)
     return np.broadcast_to(found, (len(found), count)).T

@@ -13,7 +13,7 @@ from ..array_types import Real
 from ..errors import RequestError
 from ..files.outputs import METADATA
 from ..files.writing import whole_file
-from ..optics.color import auto_exposure, into_gamut, on_screen, spectrum_to_linear_sRGB
+from ..optics.color import auto_exposure, into_gamut, on_screen, radiance_to_linear_sRGB
 from ..surface.heightfield import HeightField
 from ..surface.periods import hann, repeated, with_uncertainty
 from .predicted_colours import WAVELENGTHS, radiance
@@ -226,8 +226,8 @@ def _facts(axes: Axes, inspection: Inspection) -> None:
 
 def _colours(rows: list[Axes], inspection: Inspection) -> None:
     """Plot one strip for each angle of incidence, its specular direction marked."""
-    spectra = radiance(inspection.spectrum, inspection.direction, np.array(INCIDENCES)[:, None], _ANGLES)
-    rgb = into_gamut(spectrum_to_linear_sRGB(spectra, WAVELENGTHS))
+    radiances = radiance(inspection.spectrum, inspection.direction, np.array(INCIDENCES)[:, None], _ANGLES)
+    rgb = into_gamut(radiance_to_linear_sRGB(radiances, WAVELENGTHS))
     # Exposed without the specular direction, which would make the rest black.
     off_specular = [strip[np.abs(_ANGLES - incidence) > 5] for strip, incidence in zip(rgb, INCIDENCES, strict=True)]
     shown = on_screen(rgb * auto_exposure(np.concatenate(off_specular)))

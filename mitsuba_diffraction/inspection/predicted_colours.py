@@ -22,7 +22,7 @@ from scipy.ndimage import grey_dilation, grey_erosion
 
 from ..array_types import Real
 from ..errors import RequestError
-from ..optics.color import XYZ_to_linear_sRGB, daylight, delta_E, hex_code, into_gamut, spectrum_to_XYZ
+from ..optics.color import XYZ_to_linear_sRGB, daylight, delta_E, hex_code, into_gamut, radiance_to_XYZ
 from ..optics.geometry import k_g
 from ..precomputation.grating_spectrum import GratingSpectrum
 from ..settings import VISIBLE
@@ -36,7 +36,7 @@ WAVELENGTHS = np.arange(VISIBLE[0], VISIBLE[1] + 1, 2.0)  # nm; fine enough for 
 def illumination() -> Real:
     """Return D65 at `WAVELENGTHS`, of luminance Y = 1."""
     values = daylight(WAVELENGTHS)
-    return values / spectrum_to_XYZ(values, WAVELENGTHS)[1]
+    return values / radiance_to_XYZ(values, WAVELENGTHS)[1]
 
 
 def radiance(
@@ -96,7 +96,7 @@ def colours_at(spectrum: GratingSpectrum, direction: float, angles: ArrayLike, v
     for angle, view in product(np.ravel(angles).tolist(), np.ravel(views).tolist()):
         # A white sheet has the radiance D65 cos θ_i/π.
         factor = np.pi / np.cos(np.deg2rad(angle))
-        XYZ = np.maximum(factor * spectrum_to_XYZ(radiance(spectrum, direction, angle, view), WAVELENGTHS), 0)
+        XYZ = np.maximum(factor * radiance_to_XYZ(radiance(spectrum, direction, angle, view), WAVELENGTHS), 0)
         found.append(Colour(angle, view, tuple(XYZ.tolist()), hex_code(into_gamut(XYZ_to_linear_sRGB(XYZ)))))
     return tuple(found)
 
@@ -181,8 +181,8 @@ class _AtNormalIncidence(NamedTuple):
 
     def XYZ(self, theta_o: float) -> Real:
         """Return non-negative XYZ in a direction, degrees."""
-        spectra = radiance(self.spectrum, self.direction, 0.0, theta_o, **self.scale)
-        return np.maximum(spectrum_to_XYZ(spectra, WAVELENGTHS), 0)
+        radiances = radiance(self.spectrum, self.direction, 0.0, theta_o, **self.scale)
+        return np.maximum(radiance_to_XYZ(radiances, WAVELENGTHS), 0)
 
 
 def changes(

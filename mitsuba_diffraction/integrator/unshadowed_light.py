@@ -113,7 +113,7 @@ def _radiance(scene: mi.Scene, lamps: list[mi.Shape]) -> NDArray[np.float64]:
     number = dr.gather(mi.UInt32, on_device(numbers, mi.UInt32), index // side**2)
     emitter = dr.gather(mi.EmitterPtr, scene.emitters_dr(), number)
     si = dr.zeros(mi.SurfaceInteraction3f, dr.width(index))
-    si.shape, si.wi, si.wavelengths = emitter.get_shape(), mi.Vector3f(0, 0, 1), _spectrum()
+    si.shape, si.wi, si.wavelengths = emitter.get_shape(), mi.Vector3f(0, 0, 1), _wavelengths()
     cell = index % side**2
     si.uv = (mi.Point2f(mi.Float(cell % side), mi.Float(cell // side)) + 0.5) / side
     value = np.array(_mean(emitter.eval(si))).reshape(len(lamps), -1).max(axis=1).astype(np.float64)
@@ -121,7 +121,7 @@ def _radiance(scene: mi.Scene, lamps: list[mi.Shape]) -> NDArray[np.float64]:
     return np.where(value > 0, value, value.max(initial=0.0) or 1.0)
 
 
-def _spectrum() -> mi.Spectrum:
+def _wavelengths() -> mi.Spectrum:
     return mi.Spectrum(_WAVELENGTHS[: dr.size_v(mi.Spectrum)])
 
 
@@ -186,12 +186,12 @@ def _environment_map(environment: mi.Emitter) -> mi.Float:
     y = dr.select(below, dr.mulsign(1 - dr.abs(u), v), v)
     rng = mi.PCG32(size=_DRAWN)
     point = dr.zeros(mi.Interaction3f, _DRAWN)
-    point.wavelengths = _spectrum()
+    point.wavelengths = _wavelengths()
     drawn, _ = environment.sample_direction(point, mi.Point2f(rng.next_float32(), rng.next_float32()), True)
     maxima = dr.zeros(mi.Float, MAP_SIDE**2)
     for omega in (dr.normalize(mi.Vector3f(x, y, z)), drawn.d):
         si = dr.zeros(mi.SurfaceInteraction3f, dr.width(omega))
-        si.wi, si.wavelengths = -omega, _spectrum()
+        si.wi, si.wavelengths = -omega, _wavelengths()
         dr.scatter_reduce(dr.ReduceOp.Max, maxima, _mean(environment.eval(si)), _octahedral_cell(omega))
     cells = _folded_out(np.array(maxima).reshape(MAP_SIDE, MAP_SIDE))
     around = [cells[j : j + MAP_SIDE, i : i + MAP_SIDE] for j in range(3) for i in range(3)]

@@ -25,7 +25,7 @@ from ..errors import RequestError
 from ..files.outputs import MARK
 from ..files.picture_file import read_picture
 from ..files.writing import whole_file
-from ..optics.color import spectrum_to_linear_sRGB
+from ..optics.color import radiance_to_linear_sRGB
 
 PERIOD, DEPTH = 1.5, 0.25  # µm, as in hologram.xml
 SIZE = 16.0, 9.0  # cm, of the hologram
@@ -39,7 +39,7 @@ def stripe_brightness(linear: Real) -> Real:
     """Return the brightness of the three stripes, from 0 to 1, for linear sRGB (rows, columns, 3)."""
     wavelengths = np.arange(380, 781) * 1e-3
     bands = np.exp(-0.5 * ((wavelengths[:, None] / STRIPE_WAVELENGTHS - 1) / BAND) ** 2)
-    stripes = np.maximum(linear @ np.linalg.inv(spectrum_to_linear_sRGB(bands.T, 1e3 * wavelengths)), 0)
+    stripes = np.maximum(linear @ np.linalg.inv(radiance_to_linear_sRGB(bands.T, 1e3 * wavelengths)), 0)
     return np.minimum(stripes / max(np.quantile(stripes.max(-1), WHITE_QUANTILE), 1e-3), 1)
 
 

@@ -50,10 +50,10 @@ def wanted_fractions(target: ArrayLike, plate: Plate) -> Real:
     binned = _in_bins(channels / channels.max(), count)
     if binned.shape[-1] == 3 and np.ptp(binned, axis=-1).max() > 0:
         order, matrix = np.argsort(plate.wavelengths), lamp_to_linear_sRGB(plate.wavelengths)
-        spectra = upsampled(binned, matrix[order])[..., np.argsort(order)]
+        bands = upsampled(binned, matrix[order])[..., np.argsort(order)]
     else:
-        spectra = np.repeat(binned[..., :1], len(plate.wavelengths), axis=-1)
-    wanted = np.moveaxis(spectra, -1, 0) / spectra.sum(axis=(0, 1)).max()
+        bands = np.repeat(binned[..., :1], len(plate.wavelengths), axis=-1)
+    wanted = np.moveaxis(bands, -1, 0) / bands.sum(axis=(0, 1)).max()
     middles = (plate.edges(count)[1:] + plate.edges(count)[:-1]) / 2
     near = np.hypot(*np.meshgrid(middles, middles)) < plate.pitch
     if wanted[:, ~near].sum() < 1e-9 * wanted.sum():

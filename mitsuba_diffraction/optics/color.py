@@ -45,7 +45,7 @@ def matching_functions(wavelengths: ArrayLike) -> NDArray[np.float64]:
 
 @lru_cache(maxsize=8)
 def _xyz_matrix(wavelengths: tuple[float, ...]) -> NDArray[np.float64]:
-    """Return the matrix m of `spectrum_to_XYZ`, (n, 3)."""
+    """Return the matrix m of `radiance_to_XYZ`, (n, 3)."""
     centres = np.asarray(wavelengths)
     steps = np.diff(centres)
     if centres.size < 2 or steps[0] < 1 or np.ptp(steps) > 1e-3 * steps[0]:
@@ -67,7 +67,7 @@ def _xyz_matrix(wavelengths: tuple[float, ...]) -> NDArray[np.float64]:
     return matrix
 
 
-def spectrum_to_XYZ(radiance: ArrayLike, wavelengths: ArrayLike) -> NDArray[np.float64]:
+def radiance_to_XYZ(radiance: ArrayLike, wavelengths: ArrayLike) -> NDArray[np.float64]:
     """Compute CIE 1931 XYZ of spectra.
 
     A channel i of a spectral image is L_i = ∫ L(λ) t_i(λ) dλ with a hat t_i of unit area around λ_i. Colour is
@@ -95,12 +95,12 @@ def spectrum_to_XYZ(radiance: ArrayLike, wavelengths: ArrayLike) -> NDArray[np.f
     return radiance @ _xyz_matrix(tuple(wavelengths.tolist()))
 
 
-def spectrum_to_linear_sRGB(radiance: ArrayLike, wavelengths: ArrayLike) -> NDArray[np.float64]:
+def radiance_to_linear_sRGB(radiance: ArrayLike, wavelengths: ArrayLike) -> NDArray[np.float64]:
     """Compute linear sRGB of spectra, (..., n) → (..., 3). Colours outside the gamut have negative components.
 
-    For arguments and errors see `spectrum_to_XYZ`.
+    For arguments and errors see `radiance_to_XYZ`.
     """
-    return XYZ_to_linear_sRGB(spectrum_to_XYZ(radiance, wavelengths))
+    return XYZ_to_linear_sRGB(radiance_to_XYZ(radiance, wavelengths))
 
 
 def XYZ_to_linear_sRGB(XYZ: NDArray[np.floating]) -> NDArray[np.float64]:
@@ -173,7 +173,7 @@ def lamp_to_linear_sRGB(wavelengths: NDArray[np.float64]) -> NDArray[np.float64]
     shown = np.linspace(first, last, min(41, 1 + int(last - first)))
     order = np.argsort(wavelengths)
     hats = np.stack([np.interp(shown, wavelengths[order], one) for one in np.eye(count)[:, order]])
-    return spectrum_to_linear_sRGB(hats * daylight(shown), shown) / spectrum_to_linear_sRGB(daylight(shown), shown)
+    return radiance_to_linear_sRGB(hats * daylight(shown), shown) / radiance_to_linear_sRGB(daylight(shown), shown)
 
 
 _UPSAMPLING_STEPS, _MIN_DAMPING = 60, 1e-9
@@ -197,12 +197,12 @@ def upsampled(rgb: NDArray[np.floating], matrix: NDArray[np.floating]) -> NDArra
     def lightness(values: NDArray[np.floating]) -> NDArray[np.floating]:
         return np.where(values > _DARK, np.cbrt(values), (values / _DARK + 2) * np.cbrt(_DARK) / 3)
 
-    def spectra_of(c: NDArray[np.float64]) -> NDArray[np.float64]:
+    def reflectances(c: NDArray[np.float64]) -> NDArray[np.float64]:
         p = c @ powers.T
         return 0.5 + p / (2 * np.sqrt(1 + p**2))
 
     def residual(c: NDArray[np.float64]) -> NDArray[np.float64]:
-        return lightness(spectra_of(c) @ matrix) - lightness(colours)
+        return lightness(reflectances(c) @ matrix) - lightness(colours)
 
     mean = np.clip(colours.mean(axis=-1), 0.01, 0.99)
     c = np.zeros((len(colours), 3))
@@ -211,7 +211,7 @@ def upsampled(rgb: NDArray[np.floating], matrix: NDArray[np.floating]) -> NDArra
     for _ in range(_UPSAMPLING_STEPS):
         p = c @ powers.T
         slope = (0.5 / (1 + p**2) ** 1.5)[..., None] * powers  # (colours, n, 3)
-        reached = np.maximum(spectra_of(c) @ matrix, _DARK)
+        reached = np.maximum(reflectances(c) @ matrix, _DARK)
         jacobian = np.einsum("nk,cnj->ckj", matrix, slope) / (3 * np.cbrt(reached**2))[..., None]
         normal = jacobian.swapaxes(1, 2) @ jacobian
         normal += np.eye(3) * (damping * (1e-12 + normal.trace(axis1=1, axis2=2)))[:, None, None]
@@ -220,7 +220,7 @@ def upsampled(rgb: NDArray[np.floating], matrix: NDArray[np.floating]) -> NDArra
         better = found < error
         c, error = np.where(better[:, None], c - step, c), np.where(better, found, error)
         damping = np.clip(np.where(better, damping / 4, damping * 8), _MIN_DAMPING, 1 / _MIN_DAMPING)
-    return spectra_of(c)[index].reshape(*np.shape(rgb)[:-1], len(matrix))
+    return reflectances(c)[index].reshape(*np.shape(rgb)[:-1], len(matrix))
 
 
 SRGB_TO_LMS = np.array(

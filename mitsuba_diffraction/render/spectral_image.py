@@ -26,8 +26,8 @@ from ..optics.color import (
     into_gamut,
     neutral_view,
     on_screen,
-    spectrum_to_linear_sRGB,
-    spectrum_to_XYZ,
+    radiance_to_linear_sRGB,
+    radiance_to_XYZ,
 )
 from ..spectrum.exr import load_exr, refuse_incomplete, silence
 
@@ -131,7 +131,7 @@ class SpectralImage:
         """Return whether float16 rounds the picture by no more than 0.05 %, of radiance or of the mean radiance."""
         total, largest = 0.0, 0.0
         for block in self.blocks():
-            rgb = spectrum_to_linear_sRGB(block, self.wavelengths)
+            rgb = radiance_to_linear_sRGB(block, self.wavelengths)
             # NaN is more than any limit.
             largest = np.maximum(largest, np.maximum(np.abs(block).max(), np.abs(rgb).max()))
             total += float(block.sum(dtype=np.float64))
@@ -186,7 +186,7 @@ class SpectralImage:
             with closing(OpenEXR.OutputFile(str(temporary), header)) as file:
                 row = 0
                 for block in self.blocks():
-                    planes = spectrum_to_linear_sRGB(block, self.wavelengths).astype(np.float32)
+                    planes = radiance_to_linear_sRGB(block, self.wavelengths).astype(np.float32)
                     if rgb:
                         planes = np.clip(planes, -limit, limit)
                     else:
@@ -305,7 +305,7 @@ def save_preview(
     """
     from PIL import Image
 
-    picture = np.concatenate([spectrum_to_XYZ(block, image.wavelengths).astype(np.float32) for block in image.blocks()])
+    picture = np.concatenate([radiance_to_XYZ(block, image.wavelengths).astype(np.float32) for block in image.blocks()])
     if denoise is not None:
         picture = denoise(picture)
     blocks = split_rows(*picture.shape[:2])

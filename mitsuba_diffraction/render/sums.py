@@ -28,7 +28,7 @@ from numpy.typing import NDArray
 from ..errors import RequestError
 from ..files.reading import check_file
 from ..files.writing import UNSEALED, discard, is_intact, seal, whole_file
-from ..optics.color import spectrum_to_XYZ
+from ..optics.color import radiance_to_XYZ
 from ..settings import VISIBLE
 from .spectral_film import SpectralRange, channel_wavelengths
 from .spectral_image import SpectralImage, split_rows
@@ -75,7 +75,7 @@ class Accumulation:
     def add(self, traced: NDArray[np.float32], samples: int) -> None:
         """Add the result of `trace_pass` with that many samples per pixel."""
         wavelengths = channel_wavelengths(self.spectral_range)
-        weights = spectrum_to_XYZ(np.eye(wavelengths.size), wavelengths)[:, 1]
+        weights = radiance_to_XYZ(np.eye(wavelengths.size), wavelengths)[:, 1]
         # einsum adds in an order that depends on the layout alone, which differs between machines of a cluster; a
         # matrix product may be multithreaded.
         rows = (np.ascontiguousarray(row[:, : weights.size], np.float64) for row in traced)

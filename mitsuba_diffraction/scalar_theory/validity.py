@@ -23,7 +23,7 @@ from ..rigorous.rigorous_spectrum import MAX_PERIOD_IN_WAVELENGTHS
 from ..rigorous.solver import converge
 from ..settings import VISIBLE
 from ..surface.heightfield import HeightField
-from ..surface.periods import height_spectrum
+from ..surface.periods import powers_of_heights
 from .closed_form import efficiency_difference, profile_powers, scalar_orders, transmitted_orders
 
 MAP = Path(__file__).parents[1] / "data" / "scalar_error.json"
@@ -191,7 +191,7 @@ class Waves:
     @classmethod
     def of(cls, height_field: HeightField, extent: str) -> Waves:
         """Determine the waves of a surface; a "sample" is levelled first."""
-        frequencies, power, rms_height = height_spectrum(height_field, extent)
+        frequencies, power, rms_height = powers_of_heights(height_field, extent)
         kept = power > _MIN_POWER * power.sum()
         steps = np.rint(_WAVES_PER_OCTAVE * np.log2(1 / np.maximum(frequencies[kept], 1e-12)))
         found, where = np.unique(steps, return_inverse=True)

@@ -16,7 +16,7 @@ from ..bsdf.layers import Layers
 from ..errors import RequestError
 from ..parameter_documentation import Parameter, listed
 from .evaluate import VARIANTS
-from .lights import Light, lights_of, sampled_spectrum
+from .lights import Light, lights_of, per_nanometre
 from .pq import PQ
 from .quirks import Quirks
 from .shader import Shader
@@ -116,7 +116,7 @@ def define() -> type:
             self.shaded = []
             for layers in (bsdf.layers for bsdf in self.gratings):
                 shader, r_0 = self.shader_of(layers), _normal_reflectance(layers)
-                weights = [shader.weights(r_0, light.spectrum) for light in self.lights]
+                weights = [shader.weights(r_0, light.irradiance) for light in self.lights]
                 scale = self.brightness * shader.brightness_unit if shader.has_free_scale else 1.0
                 self.shaded.append(Shaded(layers, shader, weights, base_weight, opaque(scale)))
 
@@ -235,4 +235,4 @@ def parameters_of_variant(variant: str) -> tuple[str, ...]:
 
 def _normal_reflectance(layers: Layers) -> NDArray[np.float64]:
     """Return R at normal incidence at `tristimulus.wavelengths`, (401,)."""
-    return sampled_spectrum(lambda si: layers.grating.theory.boundary(si, mi.Float(1), mi.Bool(True)))
+    return per_nanometre(lambda si: layers.grating.theory.boundary(si, mi.Float(1), mi.Bool(True)))

@@ -15,7 +15,7 @@ from ..errors import RequestError
 from .tristimulus import wavelengths
 
 
-def sampled_spectrum(evaluate: Callable[[mi.SurfaceInteraction3f], mi.UnpolarizedSpectrum]) -> NDArray[np.float64]:
+def per_nanometre(evaluate: Callable[[mi.SurfaceInteraction3f], mi.UnpolarizedSpectrum]) -> NDArray[np.float64]:
     """Evaluate a spectral function of a SurfaceInteraction3f at `tristimulus.wavelengths`: (401,)."""
     nanometres, channels = wavelengths(), len(mi.UnpolarizedSpectrum(0))
     groups = np.resize(nanometres, (-(-nanometres.size // channels), channels))
@@ -28,7 +28,7 @@ class Light:
 
     Attributes:
         emitter: the Mitsuba emitter.
-        spectrum: (401,) at `tristimulus.wavelengths`: normal irradiance per nm, for point lights at distance one.
+        irradiance: (401,) at `tristimulus.wavelengths`: at normal incidence, per nm, for point lights at distance one.
     """
 
     KINDS = (DIRECTIONAL, POINT)
@@ -39,17 +39,17 @@ class Light:
         # At distance one from a point light; directional light is uniform.
         origin = mi.Point3f(mi.traverse(emitter)["position"]) if self.at_point else mi.Point3f(0)
 
-        def irradiance(si: mi.SurfaceInteraction3f) -> mi.UnpolarizedSpectrum:
+        def at_normal_incidence(si: mi.SurfaceInteraction3f) -> mi.UnpolarizedSpectrum:
             si.p = origin + mi.Vector3f(0, 0, 1)
             _, value = emitter.sample_direction(si, mi.Point2f(0.5), True)
             return mi.unpolarized_spectrum(value)
 
-        self.spectrum = sampled_spectrum(irradiance)
+        self.irradiance = per_nanometre(at_normal_incidence)
 
     def sample(
         self, si: mi.SurfaceInteraction3f, active: mi.Bool
     ) -> tuple[mi.DirectionSample3f, mi.Float, mi.UnpolarizedSpectrum]:
-        """Return direction of the light, factor of `spectrum`, and irradiance at the wavelengths of the ray."""
+        """Return direction of the light, factor of `irradiance`, and irradiance at the wavelengths of the ray."""
         ds, value = self.emitter.sample_direction(si, mi.Point2f(0.5), active)
         falloff = dr.rcp(dr.square(ds.dist)) if self.at_point else mi.Float(1)
         return ds, falloff, mi.unpolarized_spectrum(value)

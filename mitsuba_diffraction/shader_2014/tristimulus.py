@@ -44,9 +44,9 @@ def d65_weights() -> NDArray[np.float64]:
     return weights / np.trapezoid(weights[:: int(WAVELENGTH_STEP), 1], dx=WAVELENGTH_STEP)
 
 
-def light_weights(spectrum: ArrayLike) -> NDArray[np.float64]:
-    """Return S(λ) (x̄, ȳ, z̄)/∫ȳ dλ, (401, 3) per nm, for the spectrum S of a light at `wavelengths`, (401,) per nm."""
-    return np.asarray(spectrum, np.float64)[:, None] * matching_functions(wavelengths()) / FLAT
+def light_weights(irradiance: ArrayLike) -> NDArray[np.float64]:
+    """Return S(λ) (x̄, ȳ, z̄)/∫ȳ dλ, (401, 3) per nm, for the irradiance S of a light at `wavelengths`, (401,) per nm."""
+    return np.asarray(irradiance, np.float64)[:, None] * matching_functions(wavelengths()) / FLAT
 
 
 def rgb_matrix(*, cie_rgb_matrix: bool) -> NDArray[np.float64]:
@@ -67,7 +67,7 @@ class SpectralWeights:
             quirks: `fixed_index`, `d65_light` and `relative` apply.
             peak: S(0) of a flat surface, µm².
             r_0: power reflectance at normal incidence, one number or (401,) at `tristimulus.wavelengths`.
-            light: spectrum of the light, (401,); None for D65 with Y = 1.
+            light: its irradiance, (401,); None for D65 with Y = 1.
         """
         weights = d65_weights() if light is None else light_weights(light)
         self.luminance = 1.0 if light is None else float(np.trapezoid(weights[:, 1]))
@@ -95,11 +95,11 @@ def interpolated(table: PacketTable, position: mi.Float, last: int, active: mi.B
 
 
 EMISSION = np.arange(VISIBLE[0], VISIBLE[1] + 0.5, 5.0)
-"""The nodes of `primary_spectra`, nm."""
+"""The nodes of `emission_of_primaries`, nm."""
 
 
 @lru_cache(maxsize=1)
-def primary_spectra() -> NDArray[np.float64]:
+def emission_of_primaries() -> NDArray[np.float64]:
     """Return spectra b_c(λ) of the sRGB primaries at `EMISSION`, piecewise linear: (95, 3).
 
     The spectrum Σ_c RGB_c b_c(λ) has the colour RGB. b_c is the non-negative spectrum of least power, whose smoothness
@@ -110,10 +110,10 @@ def primary_spectra() -> NDArray[np.float64]:
     to_xyz = matching_functions(fine).T @ hats / FLAT
     system = np.concatenate([1e4 * to_xyz, 1e-2 * np.eye(EMISSION.size)])
     rest = np.zeros(EMISSION.size)
-    spectra = [
+    columns = [
         lsq_linear(system, np.concatenate([1e4 * target, rest]), bounds=(0, np.inf)).x for target in SRGB_TO_XYZ.T
     ]
-    result = np.stack(spectra, axis=1)
+    result = np.stack(columns, axis=1)
     # Removes the small colour error due to the least-power term.
     result = result @ np.linalg.solve(to_xyz @ result, SRGB_TO_XYZ)
     result.setflags(write=False)
@@ -121,11 +121,11 @@ def primary_spectra() -> NDArray[np.float64]:
 
 
 class Emission:
-    """A spectrum of given linear sRGB: Σ_c RGB_c b_c(λ), with b_c from `tristimulus.primary_spectra`."""
+    """A spectrum of given linear sRGB: Σ_c RGB_c b_c(λ), with b_c from `tristimulus.emission_of_primaries`."""
 
     def __init__(self) -> None:
-        spectra = primary_spectra()
-        self.table = PacketTable(np.concatenate([spectra, np.zeros((len(spectra), 1))], axis=1))
+        columns = emission_of_primaries()
+        self.table = PacketTable(np.concatenate([columns, np.zeros((len(columns), 1))], axis=1))
 
     def __call__(self, rgb: mi.Color3f, wavelengths: mi.UnpolarizedSpectrum, active: mi.Bool) -> mi.UnpolarizedSpectrum:
         """Evaluate the spectrum, per nm, at the wavelengths of a ray, in nm."""

@@ -158,7 +158,7 @@ def _period(q: Real, strength: float, corners: list[_Periodogram]) -> Period:
     return Period.of(q, (weight * apart.T) @ apart / max(1 - weight @ weight, 0.5), strength)
 
 
-def height_spectrum(height_field: HeightField, extent: str) -> tuple[Real, Real, float]:
+def powers_of_heights(height_field: HeightField, extent: str) -> tuple[Real, Real, float]:
     """Compute the power spectrum of the heights: of a tile as it is, of a sample levelled and under a Hann window.
 
     Returns:

@@ -106,11 +106,11 @@ def _suggestion(surface: Surface, factor: float) -> str:
 
 def reference_picture(path: str | os.PathLike[str]) -> NDArray[np.float16]:
     """Return a spectral picture as linear sRGB in half precision, (height, width, 3), the lowest row first."""
-    from ..optics.color import spectrum_to_linear_sRGB
+    from ..optics.color import radiance_to_linear_sRGB
     from ..render.spectral_image import SpectralImage
 
     image = SpectralImage.load(path)
-    rgb = spectrum_to_linear_sRGB(image.radiance, image.wavelengths)[::-1]
+    rgb = radiance_to_linear_sRGB(image.radiance, image.wavelengths)[::-1]
     largest = np.finfo(np.float16).max
     return np.clip(rgb, -largest, largest).astype(np.float16)
 

@@ -325,7 +325,7 @@ def test_changes_rebuild_only_what_depends_on_them(monkeypatch):
     bsdf = mi.load_dict(grating("deep blazed", int_ior=1.5, base={"type": "diffuse", "reflectance": uniform(0.3)}))
     parameters = mi.traverse(bsdf)
     tables = Count(monkeypatch, shared.EnergyTable, "of")
-    lines = Count(monkeypatch, shared.OrderSpectrum, "__init__")
+    lines = Count(monkeypatch, shared.ScalarOrders, "__init__")
     theory = bsdf.layers.grating.theory
     scattering, table = theory.scattering, theory.energy
     for key, value in (("orientation.value", 20.0), ("eta", 1.4), ("base.reflectance.value", 0.1)):

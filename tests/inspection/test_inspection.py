@@ -28,7 +28,7 @@ from mitsuba_diffraction.inspection.predicted_colours import (
     scanned,
 )
 from mitsuba_diffraction.inspection.properties import concerns, statistics
-from mitsuba_diffraction.optics.color import into_gamut, spectrum_to_linear_sRGB, spectrum_to_XYZ
+from mitsuba_diffraction.optics.color import into_gamut, radiance_to_linear_sRGB, radiance_to_XYZ
 from mitsuba_diffraction.scalar_theory.validity import scalar_error
 
 ROOT = Path(__file__).parents[2]
@@ -88,9 +88,9 @@ def test_levels_and_their_step_are_counted():
 def test_a_flat_surface_mirrors_daylight():
     flat = md.precompute(md.HeightField(np.zeros((8, 8)), 0.08), coherence_length=20.0)
     light = radiance(flat, 0.0, [0.0, 40.0], [0.0, 40.0])
-    XYZ = spectrum_to_XYZ(light, WAVELENGTHS)
+    XYZ = radiance_to_XYZ(light, WAVELENGTHS)
     # S(0)/λ² of one lobe is bluer than daylight by λ⁻².
-    XYZ_flat = spectrum_to_XYZ(light * (WAVELENGTHS * 1e-3) ** 2, WAVELENGTHS)
+    XYZ_flat = radiance_to_XYZ(light * (WAVELENGTHS * 1e-3) ** 2, WAVELENGTHS)
     np.testing.assert_allclose(XYZ_flat[:, :2] / XYZ_flat.sum(axis=1, keepdims=True), [[0.3127, 0.3290]] * 2, atol=1e-3)
     assert XYZ[0, 2] / XYZ[0, 0] > XYZ_flat[0, 2] / XYZ_flat[0, 0]
 
@@ -118,7 +118,7 @@ def test_colours_lie_at_the_angles_of_the_grating_equation():
         angle = order_angle(1, PERIOD, wavelength)
         assert np.sin(np.deg2rad(angle)) * PERIOD == pytest.approx(wavelength)
         for theta_i, theta_o in ((0.0, angle), (0.0, -angle), (30.0, np.degrees(np.arcsin(0.5 + wavelength / PERIOD)))):
-            rgb = into_gamut(spectrum_to_linear_sRGB(radiance(spectrum, 0.0, theta_i, theta_o), WAVELENGTHS))
+            rgb = into_gamut(radiance_to_linear_sRGB(radiance(spectrum, 0.0, theta_i, theta_o), WAVELENGTHS))
             assert rgb.argmax() == channel
     assert order_angle(4, PERIOD, 0.55) is None
 

@@ -14,9 +14,9 @@ from mitsuba_diffraction.optics.color import (
     linear_sRGB_to_XYZ,
     ocio_view,
     on_screen,
+    radiance_to_linear_sRGB,
+    radiance_to_XYZ,
     roll_off,
-    spectrum_to_linear_sRGB,
-    spectrum_to_XYZ,
     upsampled,
 )
 from mitsuba_diffraction.render.spectral_image import SpectralImage, save_preview
@@ -40,13 +40,13 @@ def exact_XYZ(spectrum):
 
 
 def test_flat_spectrum_of_one_is_equal_energy_white():
-    np.testing.assert_allclose(spectrum_to_XYZ(np.ones(GRID.size), GRID), exact_XYZ(np.ones(FINE.size)), rtol=2e-4)
-    np.testing.assert_allclose(spectrum_to_XYZ(np.ones(GRID.size), GRID)[1], 1, rtol=2e-4)
+    np.testing.assert_allclose(radiance_to_XYZ(np.ones(GRID.size), GRID), exact_XYZ(np.ones(FINE.size)), rtol=2e-4)
+    np.testing.assert_allclose(radiance_to_XYZ(np.ones(GRID.size), GRID)[1], 1, rtol=2e-4)
 
 
 def test_D65_is_white():
     d65 = colour.SDS_ILLUMINANTS["D65"]
-    rgb = spectrum_to_linear_sRGB(through_hats(np.interp(FINE, d65.wavelengths, d65.values)), GRID)
+    rgb = radiance_to_linear_sRGB(through_hats(np.interp(FINE, d65.wavelengths, d65.values)), GRID)
     np.testing.assert_allclose(rgb / rgb[1], 1, atol=2e-3)
 
 
@@ -57,27 +57,27 @@ def test_narrow_lines_have_the_right_color(wavelength, width):
     white = colour.CCS_ILLUMINANTS["CIE 1931 2 Degree Standard Observer"]["D65"]
     exact = exact_XYZ(line)
     labs = [
-        colour.XYZ_to_Lab(XYZ / (2 * exact[1]), white) for XYZ in (exact, spectrum_to_XYZ(through_hats(line), GRID))
+        colour.XYZ_to_Lab(XYZ / (2 * exact[1]), white) for XYZ in (exact, radiance_to_XYZ(through_hats(line), GRID))
     ]
     assert colour.delta_E(*labs, method="CIE 2000") < 0.25
 
 
 def test_pictures_are_converted_pixel_by_pixel():
     spectra = np.random.default_rng(1).random((3, 4, GRID.size))
-    rgb = spectrum_to_linear_sRGB(spectra, GRID)
+    rgb = radiance_to_linear_sRGB(spectra, GRID)
     assert rgb.shape == (3, 4, 3)
-    np.testing.assert_allclose(rgb[2, 1], spectrum_to_linear_sRGB(spectra[2, 1], GRID))
+    np.testing.assert_allclose(rgb[2, 1], radiance_to_linear_sRGB(spectra[2, 1], GRID))
 
 
 @pytest.mark.parametrize("grid", [[], [500.0], [500.0, 510.0, 530.0], [510.0, 500.0], [500.0, 500.5]])
 def test_other_grids_are_refused(grid):
     with pytest.raises(ValueError, match="equal steps"):
-        spectrum_to_XYZ(np.ones(len(grid)), grid)
+        radiance_to_XYZ(np.ones(len(grid)), grid)
 
 
 def test_disagreeing_shapes_are_refused():
     with pytest.raises(ValueError, match=r"\(2, 5\)"):
-        spectrum_to_XYZ(np.ones((2, 5)), GRID)
+        radiance_to_XYZ(np.ones((2, 5)), GRID)
 
 
 WAVELENGTHS = np.arange(385.0, 700.5)
@@ -279,7 +279,7 @@ def test_srgb_is_as_in_colour_science():
     np.testing.assert_allclose(color.plain_view(values), colour.cctf_encoding(values, function="sRGB"), atol=1e-12)
     np.testing.assert_array_equal(color.XYZ_TO_SRGB, colour.RGB_COLOURSPACES["sRGB"].matrix_XYZ_to_RGB)
     np.testing.assert_array_equal(color.SRGB_TO_XYZ, colour.RGB_COLOURSPACES["sRGB"].matrix_RGB_to_XYZ)
-    ultraviolet, white = spectrum_to_XYZ(np.eye(2), [250.0, 255.0]), colour.CCS_ILLUMINANTS[OBSERVER]["D65"]
+    ultraviolet, white = radiance_to_XYZ(np.eye(2), [250.0, 255.0]), colour.CCS_ILLUMINANTS[OBSERVER]["D65"]
     np.testing.assert_allclose(ultraviolet, np.tile(colour.xy_to_XYZ(white) / 2, (2, 1)), rtol=1e-12)
 
 

@@ -16,7 +16,7 @@ from PIL import Image
 
 import mitsuba_diffraction  # noqa: F401 (settles which LLVM is used before a variant is set)
 from mitsuba_diffraction.integrator.paths import LightPaths
-from mitsuba_diffraction.optics.color import spectrum_to_XYZ
+from mitsuba_diffraction.optics.color import radiance_to_XYZ
 from mitsuba_diffraction.render import SpectralImage, passes, render
 from mitsuba_diffraction.render import trace_pass as tracing
 from mitsuba_diffraction.render.passes import Interrupted, trace_locally
@@ -106,7 +106,7 @@ def test_a_picture_in_bands_has_the_expectation_of_one_in_a_single_piece(integra
 
     def rows(sums):
         """Return luminance and mean filter weight per sample of each row."""
-        luminance = spectrum_to_XYZ(sums[..., :-1], channel_wavelengths())[..., 1]
+        luminance = radiance_to_XYZ(sums[..., :-1], channel_wavelengths())[..., 1]
         return np.stack([luminance.mean(1), sums[..., -1].mean(1)]) / 36
 
     whole = np.array([rows(trace_pass(built, 36, seed)) for seed in range(8)])

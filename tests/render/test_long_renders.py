@@ -18,7 +18,7 @@ from PIL import Image
 from mitsuba_diffraction import progress  # settles which LLVM is used before a variant is set
 from mitsuba_diffraction.errors import RequestError
 from mitsuba_diffraction.files.writing import exclusive, is_intact, seal
-from mitsuba_diffraction.optics.color import spectrum_to_XYZ
+from mitsuba_diffraction.optics.color import radiance_to_XYZ
 from mitsuba_diffraction.render import SpectralImage, passes, render
 from mitsuba_diffraction.render import sums as sums_of_passes
 from mitsuba_diffraction.render.animation import frames_of, orbit
@@ -129,7 +129,7 @@ def test_until_error_stops_at_the_requested_noise():
     assert calls[done // 2][1] == pytest.approx(done, rel=0.4)
     # The pictures of other seeds scatter as was said.
     others = [render("scene.xml", spp=done, seed=seed) for seed in range(1, 9)]
-    others = np.stack([spectrum_to_XYZ(other.radiance, other.wavelengths)[..., 1] for other in others])
+    others = np.stack([radiance_to_XYZ(other.radiance, other.wavelengths)[..., 1] for other in others])
     lit = others.mean(axis=0) > 0
     spread = np.percentile(others.std(axis=0, ddof=1)[lit] / others.mean(axis=0)[lit], 90)
     assert spread == pytest.approx(0.05, rel=0.8)

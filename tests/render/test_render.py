@@ -14,7 +14,7 @@ from PIL import Image
 import mitsuba_diffraction  # noqa: F401 (settles which LLVM is used before a variant is set)
 from mitsuba_diffraction.bsdf.device_tables import PacketTable
 from mitsuba_diffraction.errors import Bug, RequestError
-from mitsuba_diffraction.optics.color import spectrum_to_linear_sRGB, spectrum_to_XYZ
+from mitsuba_diffraction.optics.color import radiance_to_linear_sRGB, radiance_to_XYZ
 from mitsuba_diffraction.render import passes, render
 from mitsuba_diffraction.render import trace_pass as tracing
 from mitsuba_diffraction.render.denoise import guides
@@ -174,7 +174,7 @@ def test_rgb_is_that_of_mitsubas_own_film(llvm, tmp_path):
     image = render(path, spp=2048)
     own = np.array(mi.render(mi.load_file(str(path)), spp=2048))
     np.testing.assert_allclose(
-        spectrum_to_linear_sRGB(image.radiance, GRID).mean((0, 1)), own[..., :3].mean((0, 1)), rtol=0.01
+        radiance_to_linear_sRGB(image.radiance, GRID).mean((0, 1)), own[..., :3].mean((0, 1)), rtol=0.01
     )
 
 
@@ -356,7 +356,7 @@ def test_colours_of_a_picture_in_passes_are_those_of_independent_samples(llvm, t
     for kind in ("independent", "multijitter"):
         path = tmp_path / f"{kind}.xml"
         path.write_text(scene.replace("independent", kind))
-        means.append(spectrum_to_XYZ(render(SceneFile(path, size=(128, 128)), spp=384).radiance.mean((0, 1)), GRID))
+        means.append(radiance_to_XYZ(render(SceneFile(path, size=(128, 128)), spp=384).radiance.mean((0, 1)), GRID))
     np.testing.assert_allclose(means[1], means[0], rtol=0.01)
 
 

@@ -6,7 +6,7 @@ import pytest
 from bsdf_support import use
 from PIL import Image
 
-from mitsuba_diffraction.optics.color import spectrum_to_linear_sRGB
+from mitsuba_diffraction.optics.color import radiance_to_linear_sRGB
 from mitsuba_diffraction.render import render
 from mitsuba_diffraction.render.scene_file import SceneFile
 
@@ -43,7 +43,7 @@ def pictures(tmp_path_factory):
         rgb = np.array(mi.render(mi.load_file(str(folder / "scene.xml")), spp=64))
         use("llvm_ad_spectral")
         image = render(SceneFile(folder / "scene.xml"), spp=256)
-        return np.array([one.mean((0, 1)) for one in (rgb, spectrum_to_linear_sRGB(image.radiance, image.wavelengths))])
+        return np.array([one.mean((0, 1)) for one in (rgb, radiance_to_linear_sRGB(image.radiance, image.wavelengths))])
 
     return of
 

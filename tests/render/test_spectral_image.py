@@ -8,7 +8,7 @@ import pytest
 from PIL import Image
 
 from mitsuba_diffraction.files.writing import whole_file
-from mitsuba_diffraction.optics.color import spectrum_to_linear_sRGB
+from mitsuba_diffraction.optics.color import radiance_to_linear_sRGB
 from mitsuba_diffraction.render import spectral_image
 from mitsuba_diffraction.render.spectral_image import SpectralImage, save_preview
 
@@ -59,7 +59,7 @@ def test_the_file_has_the_spectral_layout(image, tmp_path):
     assert len(channels) == GRID.size + 3
     assert channels["S0.405,000000nm"].pixels.dtype == np.float32
     np.testing.assert_array_equal(channels["S0.405,000000nm"].pixels, image.radiance[..., 8])
-    rgb = spectrum_to_linear_sRGB(image.radiance, GRID)
+    rgb = radiance_to_linear_sRGB(image.radiance, GRID)
     for index, name in enumerate("RGB"):
         np.testing.assert_allclose(channels[name].pixels, rgb[..., index], rtol=1e-5, atol=1e-6)
 

@@ -12,7 +12,7 @@ from bsdf_support import made_up
 from PIL import Image
 
 import mitsuba_diffraction as md
-from mitsuba_diffraction.optics.color import delta_E, spectrum_to_XYZ
+from mitsuba_diffraction.optics.color import delta_E, radiance_to_XYZ
 from mitsuba_diffraction.render.scene_file import SceneFile
 from mitsuba_diffraction.render.spectral_film import channel_wavelengths, channel_weights
 from mitsuba_diffraction.shader_2014.comparison import ComparisonRequest, compare, figure, summary
@@ -50,7 +50,7 @@ def write(
 
 
 def to_xyz(tensor):
-    return spectrum_to_XYZ(np.array(tensor) / channel_weights(), channel_wavelengths())
+    return radiance_to_XYZ(np.array(tensor) / channel_weights(), channel_wavelengths())
 
 
 # --- Differences ------------------------------------------------------------------------------------------------------
@@ -375,7 +375,7 @@ def test_compare_writes_pictures_numbers_and_a_figure(command, llvm, folder):
     assert re.search(r"\n\s*\nquirk +cause", out)  # a line between the tables
     # The pictures are those of the numbers.
     path, published = (md.render.SpectralImage.load(f"scene-gem-{name}.exr") for name in ("path", "published"))
-    xyz = [spectrum_to_XYZ(image.radiance, image.wavelengths) for image in (path, published)]
+    xyz = [radiance_to_XYZ(image.radiance, image.wavelengths) for image in (path, published)]
     surface = Pictures("scene.xml", "gem", width=12, pigment=False).surface
     again = difference(*xyz, surface, numbers["white"])
     assert again.mean == pytest.approx(found["mean"], rel=1e-3)

@@ -507,11 +507,11 @@ def test_texels_are_the_transforms_of_the_powers_of_the_heights():
 
 
 def test_spectra_of_the_primaries_have_their_colours():
-    from mitsuba_diffraction.optics.color import spectrum_to_linear_sRGB
+    from mitsuba_diffraction.optics.color import radiance_to_linear_sRGB
 
-    spectra = tristimulus.primary_spectra()
+    spectra = tristimulus.emission_of_primaries()
     assert spectra.min() > -1e-6
-    np.testing.assert_allclose(spectrum_to_linear_sRGB(spectra.T, tristimulus.EMISSION), np.eye(3), atol=6e-3)
+    np.testing.assert_allclose(radiance_to_linear_sRGB(spectra.T, tristimulus.EMISSION), np.eye(3), atol=6e-3)
     wavelengths = mi.UnpolarizedSpectrum(360, 452.5, 700, 830)
     light = np.array(tristimulus.Emission()(mi.Color3f(0.5, 1, 2), wavelengths, mi.Bool(True))).ravel()
     expected = [np.interp(w, tristimulus.EMISSION, spectra @ [0.5, 1, 2]) for w in (360, 452.5, 700, 830)]

@@ -21,8 +21,8 @@ from mitsuba_diffraction.optics.color import (
     delta_E,
     into_gamut,
     on_screen,
-    spectrum_to_linear_sRGB,
-    spectrum_to_XYZ,
+    radiance_to_linear_sRGB,
+    radiance_to_XYZ,
 )
 from mitsuba_diffraction.render import render
 from mitsuba_diffraction.shader_2014.diffraction_shader import PUBLISHED_BRIGHTNESS
@@ -524,7 +524,7 @@ def test_the_copied_scene_renders_the_same_picture(opened, tmp_path, llvm):
     scene = tab.evaluate("viewer.scene()")
     (tmp_path / "view.xml").write_text(scene.replace("elaphe_afm.toml", str(RECIPES / "elaphe_afm.toml")))
     image = render(tmp_path / "view.xml", spp=256)
-    wanted = spectrum_to_XYZ(image.radiance, image.wavelengths)
+    wanted = radiance_to_XYZ(image.radiance, image.wavelengths)
     found = np.array(tab.evaluate("Array.from(viewer.renderer.readMean().values)")).reshape(64, 64, 4)[::-1]
     inside = found[..., 3] == 1
     exposure = tab.evaluate("viewer.renderer.normal")
@@ -638,7 +638,7 @@ def test_the_scene_of_a_disc_has_its_rings(disc, opened, tmp_path, llvm):
     (tmp_path / "view.xml").write_text(scene)
     image = render(tmp_path / "view.xml", spp=4096)
     half = np.tan(np.deg2rad(14)) * tab.evaluate("viewer.state.distance")
-    luminance = np.pi * spectrum_to_XYZ(image.radiance, image.wavelengths)[32, :, 1]
+    luminance = np.pi * radiance_to_XYZ(image.radiance, image.wavelengths)[32, :, 1]
     hole, plastic, metal, beside = (luminance[int(32 + 32 * radius / half)] for radius in (0.05, 0.25, 0.6, 1.05))
     ground, zenith = 0.5, 4.63  # of the disc of the sky that is at the zenith
     assert hole == pytest.approx(ground, rel=0.01)
@@ -675,7 +675,7 @@ def test_the_sky_is_that_of_a_path_tracer(source, parameters, changes, opened, t
     scene = scene.replace(f'"{Path(source).name}"', f'"{source}"') if isinstance(source, Path) else scene
     (tmp_path / "view.xml").write_text(re.sub(r'"fov" value="\d+"', '"fov" value="5"', scene))
     image = render(tmp_path / "view.xml", spp=512)
-    wanted = spectrum_to_XYZ(image.radiance, image.wavelengths).mean(axis=(0, 1))
+    wanted = radiance_to_XYZ(image.radiance, image.wavelengths).mean(axis=(0, 1))
     np.testing.assert_allclose(middle[..., :3].mean(axis=(0, 1)), wanted, rtol=0.03)
 
 
@@ -698,7 +698,7 @@ def test_a_designed_plate_opens_with_its_picture_on_a_wall(cat, opened, tmp_path
     scene = tab.evaluate("viewer.scene()").replace('"cat.toml"', f'"{RECIPES / "designed" / "cat.toml"}"')
     (tmp_path / "view.xml").write_text(scene)
     image = render(tmp_path / "view.xml", spp=64)
-    wanted = spectrum_to_XYZ(image.radiance, image.wavelengths)[..., 1]
+    wanted = radiance_to_XYZ(image.radiance, image.wavelengths)[..., 1]
     assert wanted.shape == found.shape
     # The noise of single pixels aside.
     blocks = [
@@ -730,7 +730,7 @@ def test_a_reference_picture_is_compared(opened):
 
 def test_colours_are_shown_as_in_previews(opened):
     """Lines of a spectrum beside a grey, from dark to bright, against the preview of the same picture."""
-    lines = spectrum_to_linear_sRGB(np.eye(81)[10:70:6], np.arange(380.0, 781.0, 5.0))
+    lines = radiance_to_linear_sRGB(np.eye(81)[10:70:6], np.arange(380.0, 781.0, 5.0))
     light = np.concatenate([factor * lines / lines.max() for factor in (0.1, 1.0, 8.0)] + [np.full((1, 3), 0.5)])
     picture = np.tile(np.repeat(light, 4, 0), (200, 1, 1))
     blaze = Surface.named("blazed", {"depth": 0.1, "samples": 64, "coherence_length": 3.0})

@@ -19,7 +19,7 @@ from scipy.optimize import minimize
 
 import mitsuba_diffraction  # noqa: F401  (before Mitsuba)
 from mitsuba_diffraction.export.working_spaces import WORKING_SPACES
-from mitsuba_diffraction.optics.color import SRGB_TO_XYZ, XYZ_to_linear_sRGB, delta_E, spectrum_to_XYZ
+from mitsuba_diffraction.optics.color import SRGB_TO_XYZ, XYZ_to_linear_sRGB, delta_E, radiance_to_XYZ
 
 SIZE, RADIUS, PASSES, PASS = 96, 0.15, 4, 512
 WAVELENGTHS = np.arange(390, 721, 10.0)
@@ -59,7 +59,7 @@ def path_traced(shape, parameters):
         }
     )
     spectra = sum(np.array(mi.render(scene, spp=PASS, seed=seed)) for seed in range(PASSES)) / PASSES
-    return spectrum_to_XYZ(spectra.reshape(-1, len(WAVELENGTHS)), WAVELENGTHS).reshape(SIZE, SIZE, 3)
+    return radiance_to_XYZ(spectra.reshape(-1, len(WAVELENGTHS)), WAVELENGTHS).reshape(SIZE, SIZE, 3)
 
 
 def in_cycles(suffix, shape, parameters, samples, space):

@@ -23,7 +23,7 @@ from numpy.typing import NDArray
 from mitsuba_diffraction.evaluation.benchmark.noise import load_for_noise
 from mitsuba_diffraction.files.outputs import METADATA
 from mitsuba_diffraction.files.writing import examples_folder, whole_file
-from mitsuba_diffraction.optics.color import XYZ_to_linear_sRGB, spectrum_to_XYZ
+from mitsuba_diffraction.optics.color import XYZ_to_linear_sRGB, radiance_to_XYZ
 from mitsuba_diffraction.progress import progress_bar, say
 from mitsuba_diffraction.render.passes import split
 from mitsuba_diffraction.render.scene import shows_gratings
@@ -52,7 +52,7 @@ def picture(scene: mi.Scene, samples: int, seed: int) -> tuple[Array, float]:
     begin = time.process_time()
     for index, some in enumerate(split(scene, samples)):
         sums.add(trace_pass(scene, some, pass_seed(seed, index)), some)
-    return spectrum_to_XYZ(sums.radiance(), channel_wavelengths()), time.process_time() - begin
+    return radiance_to_XYZ(sums.radiance(), channel_wavelengths()), time.process_time() - begin
 
 
 def errors(reference: Array, xyz: Array, where: NDArray[np.bool_]) -> tuple[float, float]:

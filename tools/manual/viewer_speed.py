@@ -21,7 +21,7 @@ from live_browser import draw, opened
 from live_pages import RECIPES, SURFACES
 from playwright.sync_api import Page
 
-from mitsuba_diffraction.optics.color import XYZ_to_linear_sRGB, auto_exposure, delta_E, into_gamut, spectrum_to_XYZ
+from mitsuba_diffraction.optics.color import XYZ_to_linear_sRGB, auto_exposure, delta_E, into_gamut, radiance_to_XYZ
 from mitsuba_diffraction.render import render
 from mitsuba_diffraction.variants import choose_variant
 
@@ -77,7 +77,7 @@ def measured(surface: str) -> dict[str, tuple[float, float]]:
         with tempfile.TemporaryDirectory() as folder:
             (path := Path(folder) / "view.xml").write_text(scene)
             image = render(path, spp=SPP)
-        wanted = spectrum_to_XYZ(image.radiance, image.wavelengths)
+        wanted = radiance_to_XYZ(image.radiance, image.wavelengths)
         for variant in NAMES:
             draw(tab, {**state, "right": variant}, 4 if variant == "none" else 1)
             side = "model" if variant == "none" else "shader"

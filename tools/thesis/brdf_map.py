@@ -11,7 +11,7 @@ from viewing_angle import MODEL, relative_reflectance, wavelengths
 
 from mitsuba_diffraction.bsdf.testing import direction
 from mitsuba_diffraction.errors import RequestError
-from mitsuba_diffraction.optics.color import auto_exposure, daylight, into_gamut, on_screen, spectrum_to_linear_sRGB
+from mitsuba_diffraction.optics.color import auto_exposure, daylight, into_gamut, on_screen, radiance_to_linear_sRGB
 from mitsuba_diffraction.shader_2014.evaluate import VARIANTS, colour
 
 Array = NDArray[np.float64]
@@ -116,4 +116,4 @@ def _linear_rgb(surface: PublishedSurface, method: str, wi: Array, wo: Array) ->
         return colour(surface.height_field, wi, wo, variant=method, **settings)
     nanometres = wavelengths()
     values = relative_reflectance(surface.spectrum, wi, wo, nanometres)
-    return spectrum_to_linear_sRGB(values * daylight(nanometres), nanometres)
+    return radiance_to_linear_sRGB(values * daylight(nanometres), nanometres)

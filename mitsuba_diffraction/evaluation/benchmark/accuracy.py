@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from ...array_types import Real
 from ...bsdf.testing import direction
-from ...optics.color import daylight, delta_E, spectrum_to_XYZ
+from ...optics.color import daylight, delta_E, radiance_to_XYZ
 from ...precomputation.grating_spectrum import GratingSpectrum
 from ...scalar_theory.reference import power_spectrum
 from ...spectrum.grids import OrderGrid
@@ -110,7 +110,7 @@ class Exact:
 
     def _xyz(self, s: Real) -> Real:
         light = daylight(self._wavelengths) / (self._wavelengths * 1e-3) ** 2
-        return spectrum_to_XYZ(s * light, self._wavelengths)
+        return radiance_to_XYZ(s * light, self._wavelengths)
 
     def accuracy(self, spectrum: GratingSpectrum) -> Accuracy:
         """Compute the errors of a spectrum of the same case."""

@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ...files.writing import examples_folder
-from ...optics.color import spectrum_to_linear_sRGB
+from ...optics.color import radiance_to_linear_sRGB
 from ...progress import Progress, silent
 from ...render.scene import instantiated, shows_gratings
 from ...render.scene_file import SceneFile
@@ -112,7 +112,7 @@ def measure_noise(
             kinds += [load_for_noise(path, width, other, max_depth=depth) for other in others.values()]
             shown = shows_gratings(kinds[0])
             times, radiance = _alternating(kinds, samples, pictures)
-            own, *theirs = spectrum_to_linear_sRGB(radiance, channel_wavelengths())
+            own, *theirs = radiance_to_linear_sRGB(radiance, channel_wavelengths())
             for beside, time_of_it, of_it in zip(others, times[1:], theirs, strict=True):
                 ratios = [relative_noise(own, some) / relative_noise(of_it, some) for some in (shown, shown | True)]
                 found.append(Noise(path.stem, beside, depth, times[0], times[0] / time_of_it, *ratios))

@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 
 from ...bsdf.theory import errors_shown
 from ...errors import RequestError
-from ...optics.color import XYZ_to_linear_sRGB, delta_E, into_gamut, on_screen, spectrum_to_XYZ
+from ...optics.color import XYZ_to_linear_sRGB, delta_E, into_gamut, on_screen, radiance_to_XYZ
 from ...precomputation.grating_spectrum import GratingSpectrum
 from ...progress import Progress, no_progress
 from ...render import SpectralImage
@@ -188,7 +188,7 @@ def _traced(scene: mi.Scene, samples: int) -> tuple[Picture, float]:
     clock = time.process_time if mi.variant().startswith("llvm") else time.perf_counter
     columns, rows = scene.sensors()[0].film().crop_size()
     sums, passes = Accumulation.empty(rows, columns), split(scene, samples, 2)
-    spectrum_to_XYZ(sums.radiance(), channel_wavelengths())  # loads the observer
+    radiance_to_XYZ(sums.radiance(), channel_wavelengths())  # loads the observer
     # By `path`: the wavelengths that `diffraction_path` keeps depend on their values, and differ between pictures.
     integrator = getattr(scene.integrator(), "path", scene.integrator())
     begin = clock()

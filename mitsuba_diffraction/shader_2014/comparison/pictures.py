@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 
 from ...bsdf.device_tables import on_device
 from ...errors import RequestError
-from ...optics.color import spectrum_to_XYZ
+from ...optics.color import radiance_to_XYZ
 from ...progress import Progress, part, silent
 from ...render import SpectralImage
 from ...render.passes import split
@@ -43,7 +43,7 @@ from ..lights import lights_of
 from ..quirks import Quirks
 from ..shader import Shader, TextureShader
 from ..surfaces import gratings_of, sum_along
-from ..tristimulus import EMISSION, primary_spectra
+from ..tristimulus import EMISSION, emission_of_primaries
 
 
 @functools.cache
@@ -145,7 +145,7 @@ class Picture:
     xyz: NDArray[np.float64] = field(init=False)
 
     def __post_init__(self) -> None:
-        object.__setattr__(self, "xyz", spectrum_to_XYZ(self.image.radiance, self.image.wavelengths))
+        object.__setattr__(self, "xyz", radiance_to_XYZ(self.image.radiance, self.image.wavelengths))
 
 
 class Pictures:
@@ -358,9 +358,9 @@ class Pictures:
         if luminance is not None and not mean > 0:
             raise RequestError(f"brightness: got diffraction of the mean luminance {mean:.3g}, wanted a positive one")
         scale = 1.0 if luminance is None else luminance / mean
-        radiance = [rest.image.radiance + scale * rgb @ _channel_spectra().T for rgb, _ in parts]
+        radiance = [rest.image.radiance + scale * rgb @ _channel_emission().T for rgb, _ in parts]
         wavelengths = rest.image.wavelengths
-        halves = np.array([spectrum_to_XYZ(half, wavelengths) for half in radiance]) if len(parts) > 1 else None
+        halves = np.array([radiance_to_XYZ(half, wavelengths) for half in radiance]) if len(parts) > 1 else None
         seconds = rest.seconds + sum(seconds for _, seconds in parts)
         image = SpectralImage(wavelengths, np.mean(radiance, axis=0))
         brightness = None if brightness is None else scale * brightness
@@ -385,7 +385,7 @@ class Pictures:
         for index, some in enumerate(passes):
             traced = trace_pass(self.scene, some, pass_seed(seed, index), integrator)
             sums.add(traced, some)
-            pair[index % 2, ..., :3] += spectrum_to_XYZ(traced[..., :-1], channel_wavelengths())
+            pair[index % 2, ..., :3] += radiance_to_XYZ(traced[..., :-1], channel_wavelengths())
             pair[index % 2, ..., 3] += traced[..., -1]
             progress(sums.samples, sum(passes))
         seconds = time.perf_counter() - begin
@@ -463,12 +463,12 @@ def _check_lights(scene_file: SceneFile) -> None:
         )
 
 
-def _channel_spectra() -> NDArray[np.float64]:
-    """Return b_c of `primary_spectra`, averaged over the hats of the film's channels: (n, 3).
+def _channel_emission() -> NDArray[np.float64]:
+    """Return b_c of `emission_of_primaries`, averaged over the hats of the film's channels: (n, 3).
 
     b_c is linear between nodes at the centres of the hats, so that the average is (b₋ + 4b + b₊)/6.
     """
-    b = primary_spectra()
+    b = emission_of_primaries()
     averages = (b[:-2] + 4 * b[1:-1] + b[2:]) / 6
     assert np.array_equal(EMISSION[1:-1], channel_wavelengths())
     return averages
@@ -484,6 +484,6 @@ def _wavelengths_of_the_shader() -> Iterator[tuple[mi.UnpolarizedSpectrum, list[
     # The last ones are repeated without weight.
     fill = np.repeat(columns[-1:] * [1, 0, 0, 0], -len(columns) % count, axis=0)
     for some in np.split(np.concatenate([columns, fill]), -(-len(columns) // count)):
-        spectra = [mi.UnpolarizedSpectrum(*column) for column in some.T.tolist()]
-        dr.make_opaque(spectra)  # so that all share a kernel
-        yield spectra[0], spectra[1:]
+        emissions = [mi.UnpolarizedSpectrum(*column) for column in some.T.tolist()]
+        dr.make_opaque(emissions)  # so that all share a kernel
+        yield emissions[0], emissions[1:]
