@@ -140,6 +140,39 @@ def test_a_module_has_its_file_name_for_itself():
         assert name not in found or is_command(module, name), module
 
 
+WORDS_OF_NAMES = {
+    "material": "material",
+    "spectrum": "_?spectrum|spectrum_of|(of|is|build|load|power|build_power|_tile|_sample|grating|rigorous)_spectrum|"
+    "spectrum_error|spectrum_or_recipe(_from)?|SPECTRUM_PARAMETERS|(Power|Grating|Rigorous)?Spectrum",
+    "spectra": "_?spectra|READY_SPECTRA|handed_over_spectra",
+    "surface": "_?surfaces?|of_surface|_?SURFACES?|(Requested|Viewed)Surface|(requested|viewed|rough)_surface|"
+    "surface_text|surface_checks|_surface_lines",
+}
+"""A word whose one meaning docs/architecture.md tells → all names that have it; another thing has another name."""
+
+
+def defined_names(path):
+    """What a module defines: functions, classes, parameters, variables and attributes, and its own name."""
+    yield path.stem
+    for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
+        match node:
+            case ast.FunctionDef(name=name) | ast.ClassDef(name=name) | ast.arg(arg=name):
+                yield name
+            case ast.Name(id=name, ctx=ast.Store()) | ast.Attribute(attr=name, ctx=ast.Store()):
+                yield name
+
+
+@pytest.mark.quick
+def test_a_word_of_names_has_one_meaning():
+    names = {name for path in MODULES.values() for name in defined_names(path)}
+    table = (PACKAGE.parent / "docs" / "architecture.md").read_text(encoding="utf-8").partition("## Words")[2]
+    for word, known in WORDS_OF_NAMES.items():
+        found = {name for name in names if re.search(rf"{word}(?!l)", name.lower())}
+        assert word in found
+        assert not [name for name in sorted(found) if not re.fullmatch(known, name)]
+        assert f"`{word}`" in table
+
+
 def changed_arguments(path):
     """Lines that change an argument by an operator such as `&=`, before the function assigns anything to its name."""
     for function in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):

@@ -211,9 +211,9 @@ def check(props: mi.Properties) -> None:
         FileNotFoundError: if there is no such file.
     """
     refuse_wrong(props)
-    surface = GratingRequest.of(props).surface
-    if isinstance(surface, Recipe):
-        surface.check()
+    given = GratingRequest.of(props).spectrum_or_recipe
+    if isinstance(given, Recipe):
+        given.check()
 
 
 def define() -> type:

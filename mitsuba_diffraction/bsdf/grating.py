@@ -45,9 +45,9 @@ class Grating:
     def __init__(self, request: GratingRequest) -> None:
         self.coat, self.scales = request.coat, request.scales
         self.orientation, self.from_radius = request.orientation, request.from_radius
-        surface = request.surface
-        self.recipe = surface if isinstance(surface, Recipe) else None
-        self.spectrum = surface.cached(_per_cent) if isinstance(surface, Recipe) else surface
+        given = request.spectrum_or_recipe
+        self.recipe = given if isinstance(given, Recipe) else None
+        self.spectrum = given.cached(_per_cent) if isinstance(given, Recipe) else given
         self.theory = theory_of(self.spectrum, request)
         self._check_window(self.theory.wavelengths[0])
         self._request = request

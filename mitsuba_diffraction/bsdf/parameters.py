@@ -160,7 +160,7 @@ class Scales:
             )
 
 
-def surface_from(props: mi.Properties, media: Media, scale: float = 1.0) -> Spectrum | Recipe:
+def spectrum_or_recipe_from(props: mi.Properties, media: Media, scale: float = 1.0) -> Spectrum | Recipe:
     """Return the spectrum given by `filename` or `spectrum`, or the recipe given by `filename` or `profile`.
 
     The recipe is for the wavelengths λ/n in a coat or a dielectric, divided by the maximum `scale`, and, if it is
@@ -183,21 +183,21 @@ def surface_from(props: mi.Properties, media: Media, scale: float = 1.0) -> Spec
     if given == ["spectrum"]:
         _refuse_requested(props, "a spectrum from Python")
     if given != ["profile"]:
-        surface = handed_over.get(props["spectrum"]) if "spectrum" in given else _from_file(props, media, scale)
-        if not isinstance(surface, Spectrum | Recipe):
+        found = handed_over.get(props["spectrum"]) if "spectrum" in given else _from_file(props, media, scale)
+        if not isinstance(found, Spectrum | Recipe):
             raise RequestError(
                 f"spectrum: got {props['spectrum']!r}, wanted a spectrum in Python's load_dict; XML takes a filename"
             )
-        found = _theory_of(surface)
-        if props.get("theory", found) != found:
-            raise RequestError(f"theory: got {theory!r} with a spectrum of {found} theory, wanted one built for it")
-        return surface
+        own = _theory_of(found)
+        if props.get("theory", own) != own:
+            raise RequestError(f"theory: got {theory!r} with a spectrum of {own} theory, wanted one built for it")
+        return found
     settings = {"theory": theory, **_medium_settings(props, media)} if theory == "rigorous" else {}
     return _inside(media, scale, Recipe.of_profile(props["profile"], props, **_requested(props), **settings))
 
 
-def _theory_of(surface: Spectrum | Recipe) -> str:
-    return surface.settings.theory if isinstance(surface, Recipe) else surface.theory
+def _theory_of(found: Spectrum | Recipe) -> str:
+    return found.settings.theory if isinstance(found, Recipe) else found.theory
 
 
 def _requested(props: mi.Properties) -> dict[str, Any]:
@@ -363,7 +363,7 @@ class GratingRequest:
         media: around the grating.
         coat: the layer over it, or None.
         scales: of heights and of lengths along the surface; one in rigorous theory.
-        scale: the maximum of both, for which a recipe in `surface` is made.
+        scale: the maximum of both, for which a recipe in `spectrum_or_recipe` is made.
         orientation: degrees from the tangent to the pattern's x axis.
         from_radius: whether they are from the radius, away from the centre of the surface, instead.
         boundary: R and T of a plane, for scalar theory.
@@ -372,7 +372,7 @@ class GratingRequest:
         base: below the grating, or None.
         shadowing: whether G is a factor in scalar theory.
         conserve_energy: whether E is.
-        surface: a spectrum, or the recipe to compute one.
+        spectrum_or_recipe: a spectrum, or the recipe to compute one.
     """
 
     media: Media
@@ -386,7 +386,7 @@ class GratingRequest:
     base: Base | None
     shadowing: bool
     conserve_energy: bool
-    surface: Spectrum | Recipe
+    spectrum_or_recipe: Spectrum | Recipe
 
     @property
     def known_ranges(self) -> tuple[KnownRange, ...]:
@@ -396,7 +396,7 @@ class GratingRequest:
     @cached_property
     def _known_of_recipe(self) -> tuple[KnownRange, ...]:
         """Where the index of a rigorous recipe is known: once, as its file may be gone when a kernel is traced."""
-        settings = self.surface.settings if isinstance(self.surface, Recipe) else None
+        settings = self.spectrum_or_recipe.settings if isinstance(self.spectrum_or_recipe, Recipe) else None
         return medium_below(settings).known_ranges if isinstance(settings, RigorousSettings) else ()
 
     def widened(self, wavelengths: tuple[float, float], scale: float = 1.0) -> Recipe | None:
@@ -404,13 +404,13 @@ class GratingRequest:
 
         It covers the scales of the scene, and `scale`.
         """
-        if not isinstance(self.surface, Recipe):
+        if not isinstance(self.spectrum_or_recipe, Recipe):
             return None
-        settings = self.surface.settings
+        settings = self.spectrum_or_recipe.settings
         if settings.wavelengths != _next_to_relief(settings.theory, self.media, self.scale, VISIBLE):
             return None
         of_scene = _next_to_relief(settings.theory, self.media, max(scale, self.scales.max_scale), wavelengths)
-        return replace(self.surface, settings=replace(settings, wavelengths=of_scene))
+        return replace(self.spectrum_or_recipe, settings=replace(settings, wavelengths=of_scene))
 
     @classmethod
     def of(cls, props: mi.Properties) -> GratingRequest:
@@ -434,8 +434,8 @@ class GratingRequest:
         coat = Coat.of(media)
         bare = boundary_from(props, media, coat)
         scale, stated = scales.max_scale, None
-        surface = surface_from(props, media, scale)
-        if _theory_of(surface) == "rigorous":
+        given = spectrum_or_recipe_from(props, media, scale)
+        if _theory_of(given) == "rigorous":
             _refuse_scalar_only(props)
             # With a coat, `ext_ior` is the index above the coat.
             if any(name in props for name in ("material", "int_ior", *(["ext_ior"] if media.coat is None else []))):
@@ -461,5 +461,5 @@ class GratingRequest:
             base=base,
             shadowing=shadowing == "v_cavity",
             conserve_energy=conserve_energy,
-            surface=surface,
+            spectrum_or_recipe=given,
         )

@@ -17,7 +17,7 @@ from ..precomputation.requested_surface import RequestedSurface
 from ..precomputation.surface_text import written
 from ..progress import bytes_text, progress_bar, say, tell
 from ..viewer.page import page, reference_picture
-from ..viewer.viewed_surface import Surface
+from ..viewer.viewed_surface import ViewedSurface
 from .arguments import KEYS_OF_RECIPES, SURFACE, Overwrite, check_suffix
 
 
@@ -52,7 +52,7 @@ def view(
             shown = "the page shows the light that it reflects; `render` shows the light that a film transmits"
             say("note", f"{request.title}: {shown}")
     progress = functools.partial(progress_bar, unit="%")
-    surfaces = [Surface.requested(request, progress) for request in requests]
+    surfaces = [ViewedSurface.requested(request, progress) for request in requests]
     for request in requests:
         request.say_extent()
     stems = [one.name for one in surfaces]

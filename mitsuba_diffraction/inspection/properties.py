@@ -118,19 +118,19 @@ def inspect(
         coarse = MIN_PIXELS * max(height_field.pixel_size)
         colours_length = effective_coherence_length(piece, max(colours_length, min(used, coarse)))
     # The two changes of the tip need spectra of their own.
-    spectra = iter([(0.15, 0.4), (0.4, 0.7), (0.7, 1.0)] if measured else [(0.15, 1.0)])
+    parts = iter([(0.15, 0.4), (0.4, 0.7), (0.7, 1.0)] if measured else [(0.15, 1.0)])
 
-    def build(surface: HeightField) -> GratingSpectrum:
+    def build(field: HeightField) -> GratingSpectrum:
         with warnings.catch_warnings():
             warnings.simplefilter("ignore", UserWarning)  # on pixels and coherence, which `concerns` reports
             spectrum = precompute(
-                surface,
+                field,
                 extent=extent,
                 coherence_length=colours_length,
                 # Scaling heights by 1 + CHANGE is equivalent to shorter wavelengths.
                 wavelengths=(VISIBLE[0] / (1 + CHANGE), VISIBLE[1]),
                 tolerance=_TOLERANCE,
-                progress=part(progress, *next(spectra)),
+                progress=part(progress, *next(parts)),
             )
         assert isinstance(spectrum, GratingSpectrum)  # of scalar theory, the default
         return spectrum

@@ -127,20 +127,20 @@ def build_rigorous(
         )
     with one_thread():
         with stage("reference solutions"):
-            surface = _SolvedSurface(height_field, settings, tolerance)
-            checks = surface.checks()
+            relief = _SolvedRelief(height_field, settings, tolerance)
+            checks = relief.checks()
         steps = SOLVED_STEPS if settings.transmission == "none" else SOLVED_STEPS_TRANSMISSION
         for number, solved in enumerate(steps, 1):
             with stage(f"table {number} of at most {len(steps)}"):
-                build = _CoarseSolver(surface, solved, settings.polarised)
+                build = _CoarseSolver(relief, solved, settings.polarised)
                 values, mueller = build.table(progress, checkpoints)
             spectrum = RigorousSpectrum(
                 axes=build.axes,
                 values=values,
                 mueller=mueller,
                 settings=stored,
-                index_digest=surface.below.digest if name else "",
-                harmonics=surface.harmonics,
+                index_digest=relief.below.digest if name else "",
+                harmonics=relief.harmonics,
                 source=height_field.source,
                 source_digest=height_field.digest,
                 **dict.fromkeys(("error", "max_error", "max_error_near"), np.nan),
@@ -173,8 +173,8 @@ def medium_below(settings: RigorousSettings) -> MediumBelow:
     return below
 
 
-class _SolvedSurface:
-    """A surface, the medium below it and the solver for them.
+class _SolvedRelief:
+    """A relief, the medium below it and the solver for them.
 
     Attributes:
         below: n + ik below.
@@ -341,16 +341,16 @@ class _CoarseSolver:
     which takes most of the time. With transmission a lattice of γ and one of γ' serve all of their pairs.
     """
 
-    def __init__(self, surface: _SolvedSurface, steps: tuple[int, int, int], polarised: bool) -> None:
-        self.surface, self.steps = surface, steps
+    def __init__(self, relief: _SolvedRelief, steps: tuple[int, int, int], polarised: bool) -> None:
+        self.relief, self.steps = relief, steps
         self.entries = 4 if polarised else 1  # rows and columns of the matrices that are kept
-        self.transmits = surface.transmission != "none"
+        self.transmits = relief.transmission != "none"
         f, x, z = steps
         if self.transmits:
             f, x, z = (max(4 * n // 3, min_steps) for n, min_steps in zip(steps, _MIN_STORED_STEPS, strict=True))
-        index = surface.index(surface.wavelengths[0]).real if self.transmits else 0.0
+        index = relief.index(relief.wavelengths[0]).real if self.transmits else 0.0
         stored_steps = f, x, z if self.transmits else WAVELENGTH_NODES - 1
-        self.axes = Axes(surface.period, surface.wavelengths, stored_steps, index, surface.transmission)
+        self.axes = Axes(relief.period, relief.wavelengths, stored_steps, index, relief.transmission)
         self.fractions = [np.clip(t, _MIN_FRACTION, 1 - _MIN_FRACTION) for t in fractions_at_nodes(steps)]
         self.jobs = [(a, intervals) for a in self.fractions[0] / 2 for intervals in self.axes.blocks]
         # Holds the fields of two values of a, as one thread may be ahead of the others.
@@ -358,7 +358,7 @@ class _CoarseSolver:
 
     def table(self, progress: Progress, checkpoints: Path | None) -> tuple[NDArray[np.float32], Any]:
         """Return `values` and `mueller` of `RigorousSpectrum`."""
-        done = _Checkpoint(checkpoints, f"{self.surface.digest}-{max(self.steps)}")
+        done = _Checkpoint(checkpoints, f"{self.relief.digest}-{max(self.steps)}")
         remaining = [job for job in range(len(self.jobs)) if job not in done.done]
         solve = self._job if self.transmits else self._planes
         work = self.work()
@@ -422,7 +422,7 @@ class _CoarseSolver:
             if squares not in known:
                 square, square_below = squares
                 nu2 = (square_below - square) / self.axes.excess
-                (solved,) = self.surface.solve(a, square, [(nu2, square_below)], fields=self.fields)
+                (solved,) = self.relief.solve(a, square, [(nu2, square_below)], fields=self.fields)
                 known[squares] = self._matrices(solved, counts)
             found[:, :, x, z] = known[squares]
         return found.astype(np.float32)
@@ -446,21 +446,21 @@ class _CoarseSolver:
     def _planes(self, job: int) -> NDArray[np.float32]:
         """Return the result of `_job` where Z is the wavelength."""
         a, (above, _) = self.jobs[job]
-        surface, planes, squares = self.surface, list[Any](), self._squares(job)
+        relief, planes, squares = self.relief, list[Any](), self._squares(job)
         for square, previous in zip(squares, [None, *squares], strict=False):
             if square == previous:
                 planes.append(planes[-1])
                 continue
             wavelengths, weights = self._wavelengths(square)
-            lights = [surface.light(square, wavelength) for wavelength in wavelengths]
-            solved = [self._matrices(found, self.axes.counts(above, 0)) for found in surface.solve(a, square, lights)]
+            lights = [relief.light(square, wavelength) for wavelength in wavelengths]
+            solved = [self._matrices(found, self.axes.counts(above, 0)) for found in relief.solve(a, square, lights)]
             planes.append(np.einsum("kw,wnm...->nmk...", weights, solved))
         return np.stack(planes, axis=2).astype(np.float32)
 
     def _matrices(self, solved: Scattered, counts: tuple[int, int]) -> Real:
         """Return M, odd elements divided by k_y/ν, (incident, outgoing, i, j), in the order of the rows of `Axes`."""
         found = np.zeros((sum(counts),) * 2 + (self.entries,) * 2)
-        for (side_i, side_o), (incident, outgoing, matrices) in self.surface.matrices(solved, self.entries).items():
+        for (side_i, side_o), (incident, outgoing, matrices) in self.relief.matrices(solved, self.entries).items():
             if self.entries > 1:
                 matrices = matrices / np.where(ODD, solved.k_y / solved.k_0, 1)
             incident, outgoing = rank(incident), rank(outgoing)

@@ -19,8 +19,8 @@ from .evaluate import VARIANTS
 from .lights import Light, lights_of, per_nanometre
 from .pq import PQ
 from .quirks import Quirks
+from .shaded_gratings import Shaded, gratings_of, in_place, recipe_of_layers, sum_along
 from .shader import Shader
-from .surfaces import Shaded, gratings_of, in_place, recipe_of_layers, sum_along
 from .tristimulus import Emission
 
 PUBLISHED_BRIGHTNESS = 1000.0

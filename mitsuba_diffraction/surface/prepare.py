@@ -86,7 +86,7 @@ def _level(height_field: HeightField, degree: int) -> HeightField:
     for _ in range(2):
         residual = heights[known] - mean - coefficients @ terms
         coefficients += np.linalg.lstsq(terms @ terms.T, terms @ residual, rcond=1e-12)[0]
-    surface = sum(c * y[:, None] ** j * x**i for c, (i, j) in zip(coefficients, powers, strict=True))
+    fitted = sum(c * y[:, None] ** j * x**i for c, (i, j) in zip(coefficients, powers, strict=True))
     found = dict(zip(powers, coefficients, strict=True))
     half = [max((n - 1) / 2, 1) * size for n, size in zip((columns, rows), height_field.pixel_size, strict=True)]
     tilts = [np.degrees(np.arctan(found.get(p, 0.0) / h)) for p, h in zip([(1, 0), (0, 1)], half, strict=True)]
@@ -96,7 +96,7 @@ def _level(height_field: HeightField, degree: int) -> HeightField:
             f", bow {found.get((2, 0), 0.0) * 1e3:.3g} nm along x, {found.get((0, 2), 0.0) * 1e3:.3g} nm along y"
         )
     name = "level_plane" if degree == 1 else "level_quadratic"
-    return _after(height_field, heights - mean - surface, f"{name}: {description}")
+    return _after(height_field, heights - mean - fitted, f"{name}: {description}")
 
 
 def align_lines(height_field: HeightField) -> HeightField:

@@ -12,7 +12,7 @@ from ..precomputation.grating_spectrum import GratingSpectrum
 from ..precomputation.in_scene import in_scene
 from ..precomputation.recipe import Recipe
 from .page import page
-from .viewed_surface import Surface
+from .viewed_surface import ViewedSurface
 
 
 class View:
@@ -45,18 +45,18 @@ def view(surface: str | os.PathLike[str] | Recipe | GratingSpectrum, height: int
     return View(page(_surface(surface, parameters)), height)
 
 
-def _surface(surface: object, parameters: Mapping[str, Any]) -> Surface:
+def _surface(surface: object, parameters: Mapping[str, Any]) -> ViewedSurface:
     if isinstance(surface, GratingSpectrum):
         file = {"filename": "surface.exr"}
-        return Surface(
+        return ViewedSurface(
             "surface", surface, None, file, in_scene(parameters), '# in Python: spectrum.save("surface.exr")'
         )
     if isinstance(surface, Recipe):
         name = str(surface.surface.get("profile") or surface.surface.get("scan"))
         command = '# in Python: recipe.build().save("surface.exr")'
-        return Surface.of_recipe(surface, name, {"filename": "surface.exr"}, parameters, command=command)
+        return ViewedSurface.of_recipe(surface, name, {"filename": "surface.exr"}, parameters, command=command)
     if isinstance(surface, str | os.PathLike):
-        return Surface.named(surface, parameters)
+        return ViewedSurface.named(surface, parameters)
     raise RequestError(
         f"surface: got {type(surface).__name__}, wanted a file, a profile, a Recipe or a GratingSpectrum"
     )

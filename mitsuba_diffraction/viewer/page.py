@@ -26,7 +26,7 @@ from ..spectrum.tables import HALF_SCALE, SliceTable
 from ..surface.heightfield import HeightField
 from .arrays import encoded
 from .coil import coil
-from .viewed_surface import Surface
+from .viewed_surface import ViewedSurface
 
 MAX_PAGE_BYTES = 6_000_000  # of a page of one surface
 MAX_HEIGHTS_SIDE = 512  # pixels of the heights for the shader of 2014
@@ -57,7 +57,7 @@ _SCRIPTS = (
 )
 
 
-def page(surface: Surface, *others: Surface, picture: NDArray[np.float16] | None = None) -> str:
+def page(surface: ViewedSurface, *others: ViewedSurface, picture: NDArray[np.float16] | None = None) -> str:
     """Return the page of a surface as HTML.
 
     Args:
@@ -97,7 +97,7 @@ def page(surface: Surface, *others: Surface, picture: NDArray[np.float16] | None
     return re.sub(r"\{\{(\w+)\}\}", lambda match: parts[match[1]], text)
 
 
-def _suggestion(surface: Surface, factor: float) -> str:
+def _suggestion(surface: ViewedSurface, factor: float) -> str:
     """Return an option that makes the table of a sample smaller by a factor, as the end of a message, or ""."""
     # The nodes of a sample lie as densely as its lobes are narrow, along both axes.
     length = 0.9 * surface.spectrum.coherence_length * max(factor, 0) ** 0.5
@@ -121,7 +121,7 @@ def _json(content: object) -> str:
     return json.dumps(content, ensure_ascii=False, separators=(",", ":")).replace("<", "\\u003c")
 
 
-def _data(surface: Surface, picture: NDArray[np.float16] | None) -> dict[str, Any]:
+def _data(surface: ViewedSurface, picture: NDArray[np.float16] | None) -> dict[str, Any]:
     return {
         "name": surface.name,
         "summary": _summary(surface),
@@ -143,7 +143,7 @@ def _data(surface: Surface, picture: NDArray[np.float16] | None) -> dict[str, An
     }
 
 
-def _summary(surface: Surface) -> str:
+def _summary(surface: ViewedSurface) -> str:
     """Return what the surface is, in one line."""
     if surface.recipe is None:
         return f"Saved spectrum, coherence length {surface.spectrum.coherence_length:.3g} µm."
@@ -151,7 +151,7 @@ def _summary(surface: Surface) -> str:
     return f"{summary[0].upper()}{summary[1:]}."
 
 
-def _shape(surface: Surface) -> str:
+def _shape(surface: ViewedSurface) -> str:
     """Return the object that is shown first: the snake for skins and samples of other irregular surfaces."""
     if _profile(surface) in _RINGS:
         return "disc"
@@ -162,11 +162,11 @@ def _shape(surface: Surface) -> str:
     return "coil" if surface.spectrum.extent == "sample" or _profile(surface) in _SKINS else "sphere"
 
 
-def _profile(surface: Surface) -> str:
+def _profile(surface: ViewedSurface) -> str:
     return "" if surface.recipe is None else str(surface.recipe.surface.get("profile"))
 
 
-def _in_scene(surface: Surface) -> dict[str, Any]:
+def _in_scene(surface: ViewedSurface) -> dict[str, Any]:
     shown = surface.in_scene
     orientation, below = shown.orientation, shown.media.below
     return {
@@ -186,10 +186,10 @@ def _metal(below: MediumBelow) -> str:
     return "none" if below.index is None else "" if below.transparent else str(below.index)
 
 
-def _spectrum(surface: Surface) -> dict[str, Any]:
+def _spectrum(surface: ViewedSurface) -> dict[str, Any]:
     """Return the grid and the table: (K, terms, rows, columns) in half precision where that is exact."""
     spectrum, grid, table = surface.spectrum, surface.spectrum.grid, surface.spectrum.table
-    assert isinstance(table, SliceTable)  # see `Surface`
+    assert isinstance(table, SliceTable)  # see `ViewedSurface`
     # Nodes that no visible light reaches are zero, and take no space.
     pitch = [1 / t for t in grid.tile_size] if isinstance(grid, OrderGrid) else grid.spacing
     x, y = (np.maximum(np.abs(q) - NODES_AT_ONCE / 2 * d, 0) for q, d in zip(grid.frequencies(), pitch, strict=True))
@@ -220,7 +220,7 @@ def _spectrum(surface: Surface) -> dict[str, Any]:
     }
 
 
-def _heights(surface: Surface) -> dict[str, Any] | None:
+def _heights(surface: ViewedSurface) -> dict[str, Any] | None:
     """Return the heights for the shader of 2014, as whole numbers from the lowest; None for a saved spectrum."""
     if surface.recipe is None:
         return None

@@ -27,8 +27,8 @@ MAX_SIDE, MAX_LAYERS = 2048 - 6, 256  # with the margin of spectrum.js
 
 
 @dataclass(frozen=True, eq=False)
-class Surface:
-    """A surface and its material.
+class ViewedSurface:
+    """A surface and the media around it.
 
     Attributes:
         name: its title.
@@ -85,7 +85,7 @@ class Surface:
         parameters: Mapping[str, Any],
         progress: Callable[[str], AbstractContextManager[Progress]] = no_progress,
         command: str = "",
-    ) -> Surface:
+    ) -> ViewedSurface:
         """Return the surface of a recipe, whose spectrum is computed unless it is cached.
 
         Args:
@@ -109,7 +109,7 @@ class Surface:
         return cls(name, spectrum, recipe, grating, shown, command)
 
     @classmethod
-    def named(cls, source: str | os.PathLike[str], parameters: Mapping[str, Any]) -> Surface:
+    def named(cls, source: str | os.PathLike[str], parameters: Mapping[str, Any]) -> ViewedSurface:
         """Return the surface of a profile or a file, with parameters of it and of its material; see `requested`."""
         return cls.requested(RequestedSurface.named(os.fspath(source), parameters, OF_SCENE))
 
@@ -118,7 +118,7 @@ class Surface:
         cls,
         surface: RequestedSurface,
         progress: Callable[[str], AbstractContextManager[Progress]] = no_progress,
-    ) -> Surface:
+    ) -> ViewedSurface:
         """Return a requested surface, whose parameters in a scene (`OF_SCENE`) are set aside.
 
         Args:

@@ -203,9 +203,9 @@ def test_transmitted_efficiencies_are_reciprocal(glass, cosine, turn, side, wave
 def test_matrices_of_reversed_light_agree_with_the_solver(glass, monkeypatch):
     """The table does not store light from below to above; the sheet has its own closed sum for it."""
     monkeypatch.setattr("mitsuba_diffraction.rigorous.build_table.CHECK_COUNT", 30)
-    surface = build_table._SolvedSurface(SURFACE, replace(REQUEST, transmission=glass.transmission), 0.2)
+    relief = build_table._SolvedRelief(SURFACE, replace(REQUEST, transmission=glass.transmission), 0.2)
     errors = []
-    for alpha, g, wavelength, near, orders in surface.checks():
+    for alpha, g, wavelength, near, orders in relief.checks():
         if (1, 0) in orders and not near:
             m, matrices = orders[1, 0]
             found = glass.evaluate(m, alpha - m / 2, g, wavelength, (1, 0), mueller=True)
@@ -216,7 +216,7 @@ def test_matrices_of_reversed_light_agree_with_the_solver(glass, monkeypatch):
 
 def test_a_sheet_with_a_flat_grating_is_a_plate():
     """With all internal reflections T = (1 − R)/(1 + R) for each polarisation, and R + T = 1."""
-    flat = build_table._SolvedSurface(
+    flat = build_table._SolvedRelief(
         gratings.blazed(0.3, 0.0, samples=64), replace(REQUEST, transmission="sheet"), 0.01
     )
     k_0, alpha, k_y = 0.3 / 0.45, 0.3, 0.35
@@ -234,7 +234,7 @@ def test_a_sheet_with_a_flat_grating_is_a_plate():
 @pytest.mark.parametrize("transmission", ["interface", "sheet"])
 def test_nodes_of_imaginary_k_y_continue_fresnels_formulas(transmission):
     """Where γ > ν: Fresnel's formulas in β alone, which are real there, too; likewise for a plate."""
-    flat = build_table._SolvedSurface(
+    flat = build_table._SolvedRelief(
         gratings.blazed(0.3, 0.0, samples=64), replace(REQUEST, transmission=transmission), 0.01
     )
     nu2, square, alpha = 0.4, 0.7, 0.5
@@ -276,7 +276,7 @@ def test_an_interrupted_build_has_the_name_of_its_values(tmp_path):
 
     def digest(**indices):
         settings = RigorousSettings(wavelengths=(500, 600), tolerance=0.1, **indices)
-        return build_table._SolvedSurface(relief, settings, 0.1).digest
+        return build_table._SolvedRelief(relief, settings, 0.1).digest
 
     names = {
         digest(int_ior=2, ext_ior=1),
@@ -338,16 +338,16 @@ def test_the_work_of_a_job_is_the_number_of_its_eigenproblems(transmission, monk
 
     def counting(*arguments):
         # Harmonics that are raised where energy is not conserved cannot be foreseen.
-        if arguments[0] is surface.gratings[0]:
+        if arguments[0] is relief.gratings[0]:
             solved.append(arguments)
         return fields(*arguments)
 
     fields = build_table.half_space
     monkeypatch.setattr(build_table, "half_space", counting)
-    monkeypatch.setattr(build_table._SolvedSurface.solve, "__defaults__", (0, counting))
+    monkeypatch.setattr(build_table._SolvedRelief.solve, "__defaults__", (0, counting))
     monkeypatch.setattr(build_table, "_PAIR_WORK", 0)
-    surface = build_table._SolvedSurface(SURFACE, replace(REQUEST, transmission=transmission), 0.2)
-    jobs = build_table._CoarseSolver(surface, (3, 4, 3), polarised=False)
+    relief = build_table._SolvedRelief(SURFACE, replace(REQUEST, transmission=transmission), 0.2)
+    jobs = build_table._CoarseSolver(relief, (3, 4, 3), polarised=False)
     work, counted = jobs.work(), []
     for job in range(len(jobs.jobs)):
         solved.clear()

@@ -221,15 +221,15 @@ def test_corrected_the_shader_converges_to_the_model_within_the_limit(llvm, tmp_
     model, shader = pictures.same_light(64, 1), pictures.shaded((), 64, 1)
     # Of the corrected shader, shaded last.
     assert pictures.truncated_fraction == pytest.approx(np.exp(-((1.5 * np.pi * ratio / 2) ** 2)))
-    white = model.xyz[pictures.surface][:, 1].max()
-    found = difference(model.xyz, shader.xyz, pictures.surface, white)
+    white = model.xyz[pictures.mask][:, 1].max()
+    found = difference(model.xyz, shader.xyz, pictures.mask, white)
     if agrees:
         assert found.mean < 0.3
         assert found.exposure == pytest.approx(1, abs=0.01)
     else:
         assert found.mean > 2
         assert 0.02 < abs(found.exposure - 1) < 4 * pictures.truncated_fraction
-    published = difference(model.xyz, pictures.shaded(pictures.quirks, 64, 1).xyz, pictures.surface, white)
+    published = difference(model.xyz, pictures.shaded(pictures.quirks, 64, 1).xyz, pictures.mask, white)
     assert published.mean > 10 * found.mean
 
 
@@ -239,9 +239,9 @@ def test_corrected_the_shader_agrees_with_the_model_on_a_snake(llvm, snake):
     scene = Path(__file__).parents[2] / "scenes" / f"{snake}.xml"
     pictures = Pictures(scene, "flss", width=48, parameters={"light": "sun"})
     model = pictures.same_light(4, 16)
-    white = white_luminance(model.xyz, pictures.surface)
+    white = white_luminance(model.xyz, pictures.mask)
     corrected, published = (
-        difference(model.xyz, pictures.shaded(quirks, 4, 16).xyz, pictures.surface, white).mean
+        difference(model.xyz, pictures.shaded(quirks, 4, 16).xyz, pictures.mask, white).mean
         for quirks in ((), pictures.quirks)
     )
     # The shader has one transform of the tapered scan, and no E.
@@ -252,12 +252,12 @@ def test_corrected_the_shader_agrees_with_the_model_on_a_snake(llvm, snake):
 def test_only_pixels_covered_by_gratings_are_compared(llvm, tmp_path):
     plate = PLATE.replace("{}", '<bsdf type="diffuse"/>')
     pictures = Pictures(write(tmp_path / "scene.xml", shapes=SPHERE + plate), "gem", width=64)
-    rows, columns = pictures.surface.shape
+    rows, columns = pictures.mask.shape
     assert (rows, columns) == (48, 64)
     # The disc of a sphere at the distance √(6² + 3.8²), seen through 35° over 64 pixels, less its rim.
     radius = np.tan(np.arcsin(1 / np.hypot(6, 3.8))) / np.tan(np.deg2rad(17.5)) * 32
     disc = np.pi * radius**2
-    assert disc - 2 * np.pi * radius < pictures.surface.sum() < disc
+    assert disc - 2 * np.pi * radius < pictures.mask.sum() < disc
 
 
 @pytest.mark.slow
@@ -273,11 +273,11 @@ def test_brightness_is_fitted_to_the_diffraction_of_this_model(llvm, tmp_path, p
         # The base of the same scene, without noise of its own: the light of BSDFs other than gratings is the same.
         below = Pictures(tmp_path / "scene.xml", "gem", width=8, pigment=pigment, brightness=1e-9)
         rest = below.shaded(((NO_SHADOWS,) if picture is found else ()), 16, 64)
-        return (picture.xyz - rest.xyz)[pictures.surface][:, 1].mean()
+        return (picture.xyz - rest.xyz)[pictures.mask][:, 1].mean()
 
     assert diffraction(found) == pytest.approx(diffraction(model), rel=1e-3)
     if not pigment:
-        assert diffraction(found) == pytest.approx(found.xyz[pictures.surface][:, 1].mean(), rel=1e-5)
+        assert diffraction(found) == pytest.approx(found.xyz[pictures.mask][:, 1].mean(), rel=1e-5)
     # The number is that of the integrator, and a given one is kept.
     given = Pictures(tmp_path / "scene.xml", "gem", width=8, pigment=pigment, brightness=found.brightness)
     again = given.shaded((NO_SHADOWS,), 16, 64)
@@ -292,7 +292,7 @@ def test_a_crop_window_is_compared_alone(llvm, tmp_path):
     scene.write_text(scene.read_text().replace('<integer name="width"', window + '<integer name="width"'))
     cropped = Pictures(scene, "gem", brightness=1000)
     assert cropped.film_size == (16, 12)
-    np.testing.assert_array_equal(cropped.surface, whole.surface[:, 4:12])
+    np.testing.assert_array_equal(cropped.mask, whole.mask[:, 4:12])
     pair = [pictures.shaded((), 256, 64).xyz for pictures in (cropped, whole)]
     pair[1] = pair[1][:, 4:12]
     assert np.abs(pair[0] - pair[1]).sum() < 0.05 * pair[1].sum()
@@ -308,10 +308,10 @@ def test_the_share_of_a_quirk_is_that_of_renderings_without_it(llvm, tmp_path):
     assert steps == [(i + 1, 7) for i in range(7)]
     assert found.size == (8, 6)
     reference = pictures.same_light(4, 16)
-    white = white_luminance(reference.xyz, pictures.surface)
+    white = white_luminance(reference.xyz, pictures.mask)
 
     def mean(*quirks):
-        return difference(reference.xyz, pictures.shaded(quirks, 4, 16).xyz, pictures.surface, white).mean
+        return difference(reference.xyz, pictures.shaded(quirks, 4, 16).xyz, pictures.mask, white).mean
 
     assert found.published == pytest.approx(mean(*names))
     assert found.corrected == pytest.approx(mean())

@@ -29,7 +29,7 @@ from mitsuba_diffraction.shader_2014.diffraction_shader import PUBLISHED_BRIGHTN
 from mitsuba_diffraction.shader_2014.evaluate import VARIANTS, shader_for
 from mitsuba_diffraction.shader_2014.quirks import Quirks
 from mitsuba_diffraction.viewer import page as pages
-from mitsuba_diffraction.viewer.viewed_surface import Surface
+from mitsuba_diffraction.viewer.viewed_surface import ViewedSurface
 
 sync_api = pytest.importorskip("playwright.sync_api", reason="the package playwright is not installed")
 
@@ -123,7 +123,7 @@ def pairs_of(spectrum, count=10_000, seed=1):
 )
 def test_values_are_those_of_the_bsdf(source, parameters, changes, opened, llvm):
     """10,000 pairs of directions and wavelengths, to 1e-3 of the largest value."""
-    surface = Surface.named(RECIPES / source, parameters)
+    surface = ViewedSurface.named(RECIPES / source, parameters)
     pairs = pairs_of(surface.spectrum)
     tab = opened(surface)
     tab.evaluate("(changes) => viewer.set(changes)", {"maxFrames": 1, "hasBase": False, **changes})
@@ -160,7 +160,7 @@ def test_values_are_those_of_the_bsdf(source, parameters, changes, opened, llvm)
 )
 def test_colours_are_integrals_over_the_wavelength(source, changes, mean, percentile_95, opened):
     """Look-ups against f cos θ_i of the BSDF at each half nm: CIEDE2000 and the flux."""
-    surface = Surface.named(RECIPES / source, {})
+    surface = ViewedSurface.named(RECIPES / source, {})
     tab = opened(surface)
     tab.evaluate("(changes) => viewer.set(changes)", {"maxFrames": 1, **changes})
     pairs = pairs_of(surface.spectrum, 400)
@@ -187,7 +187,7 @@ def test_colours_are_integrals_over_the_wavelength(source, changes, mean, percen
 @pytest.mark.parametrize("source", ["blaze.toml", "elaphe_afm.toml"])
 def test_colours_are_those_of_the_shader_of_2014(source, published, opened, llvm):
     """All variants in linear RGB, to 1e-3 of the largest value; the blend is not part of it."""
-    surface = Surface.named(RECIPES / source, {})
+    surface = ViewedSurface.named(RECIPES / source, {})
     pairs = pairs_of(surface.spectrum, 1000)
     tab = opened(surface)
     tab.evaluate("viewer.set({ maxFrames: 1 })")
@@ -213,7 +213,7 @@ def test_colours_are_those_of_the_shader_of_2014(source, published, opened, llvm
 
 
 def test_a_drag_changes_the_picture_and_nothing_leaves_the_page(opened):
-    tab = opened(Surface.named("blazed", {"depth": 0.1, "samples": 64, "coherence_length": 3.0}))
+    tab = opened(ViewedSurface.named("blazed", {"depth": 0.1, "samples": 64, "coherence_length": 3.0}))
     tab.evaluate("viewer.set({ maxFrames: 1, lightWidth: 0, lightLength: 0 })")
     wait_for_frames(tab)
     before = tab.evaluate("viewer.state")
@@ -250,7 +250,7 @@ def test_a_drag_changes_the_picture_and_nothing_leaves_the_page(opened):
 
 @pytest.mark.slow
 def test_the_scene_of_a_view_has_file_names_without_folders(opened):
-    surface = Surface.named(RECIPES / "blaze.toml", {"material": "Al"})
+    surface = ViewedSurface.named(RECIPES / "blaze.toml", {"material": "Al"})
     tab = opened(surface)
     tab.evaluate("viewer.set({ maxFrames: 1 })")
     with tab.expect_download() as saved:
@@ -266,7 +266,7 @@ def test_the_scene_of_a_view_has_file_names_without_folders(opened):
 
 @pytest.mark.slow
 def test_a_slider_sets_the_brightness_of_the_shader(opened):
-    tab = opened(Surface.named("blazed", {"depth": 0.1, "samples": 64, "coherence_length": 3.0}))
+    tab = opened(ViewedSurface.named("blazed", {"depth": 0.1, "samples": 64, "coherence_length": 3.0}))
     tab.evaluate("viewer.set({ maxFrames: 1, right: 'flss' })")
     slider = tab.locator("#brightness")
     assert np.exp(float(slider.input_value())) == pytest.approx(PUBLISHED_BRIGHTNESS, rel=1e-3)
@@ -280,7 +280,7 @@ def test_a_slider_sets_the_brightness_of_the_shader(opened):
 
 @pytest.mark.slow
 def test_a_pixel_has_the_orders_of_the_grating_equation(opened):
-    tab = opened(Surface.named("blazed", {"period": 2.5, "depth": 0.25, "material": "none"}))
+    tab = opened(ViewedSurface.named("blazed", {"period": 2.5, "depth": 0.25, "material": "none"}))
     # The light is 24 degrees from the axis of the camera, in the plane across the grooves.
     tab.evaluate(
         "viewer.set({ maxFrames: 1, shape: 'plate', azimuth: -90, elevation: 89, lightAzimuth: 0, lightElevation: 66, "
@@ -318,7 +318,7 @@ def test_a_pixel_has_the_orders_of_the_grating_equation(opened):
 @pytest.mark.slow
 def test_a_colour_is_not_said_to_be_nothing(opened):
     """At a pixel that only the sky lights, and at one that is black."""
-    tab = opened(Surface.named("blazed", {"period": 2.5, "depth": 0.25, "material": "none"}))
+    tab = opened(ViewedSurface.named("blazed", {"period": 2.5, "depth": 0.25, "material": "none"}))
     remarks = []
     for sky in (0.5, 0):
         state = f"lightAzimuth: 40, lightElevation: 20, lightWidth: 0, lightLength: 0, sky: {sky}"
@@ -336,7 +336,7 @@ def test_a_colour_is_not_said_to_be_nothing(opened):
 @pytest.mark.slow
 def test_what_is_shown_first_is_complete(opened):
     """The bands of a slow first frame are not shown: a smaller picture stands there until the frame is complete."""
-    tab = opened(Surface.named("blazed", {"depth": 0.1, "samples": 64, "coherence_length": 3.0}))
+    tab = opened(ViewedSurface.named("blazed", {"depth": 0.1, "samples": 64, "coherence_length": 3.0}))
     tab.evaluate("viewer.set({ maxFrames: 4, sky: 1, shape: 'plate', azimuth: -90, elevation: 89, distance: 3 })")
     # As of a device that draws one band in each turn.
     tab.evaluate("viewer.renderer.model.milliseconds = 1e4")
@@ -374,7 +374,7 @@ def test_what_is_shown_first_is_complete(opened):
 def test_the_axes_of_the_pattern_are_those_of_the_plugin(orientation, opened, llvm):
     """ω_i along the pattern's axes at pixels of a sphere, a plate and a disc, as the scene of the view has it."""
     parameters = {"depth": 0.1, "samples": 64, "coherence_length": 3.0}
-    tab = opened(Surface.named("blazed", {**parameters, "orientation": orientation}))
+    tab = opened(ViewedSurface.named("blazed", {**parameters, "orientation": orientation}))
     grating = {"type": "diffraction_grating", "profile": "blazed", **parameters, "orientation": orientation}
     for name, kind in (("sphere", "sphere"), ("plate", "rectangle"), ("disc", "disk")):
         tab.evaluate("(shape) => viewer.set({ shape, maxFrames: 1, azimuth: -60, elevation: 50 })", name)
@@ -407,7 +407,7 @@ def test_the_axes_of_the_pattern_are_those_of_the_plugin(orientation, opened, ll
 
 @pytest.fixture(scope="module")
 def blaze():
-    return Surface.named("blazed", {"depth": 0.1, "samples": 64, "coherence_length": 3.0})
+    return ViewedSurface.named("blazed", {"depth": 0.1, "samples": 64, "coherence_length": 3.0})
 
 
 @pytest.mark.slow
@@ -509,7 +509,7 @@ def test_scales_take_as_much_light_as_a_normal_map(blaze, opened, llvm):
 @pytest.mark.slow
 def test_the_copied_scene_renders_the_same_picture(opened, tmp_path, llvm):
     """A sphere under parallel light: the mean of CIEDE2000 over its pixels, at the exposure of the page."""
-    surface = Surface.named(RECIPES / "elaphe_afm.toml", {})
+    surface = ViewedSurface.named(RECIPES / "elaphe_afm.toml", {})
     tab = opened(surface)
     size = {"width": 64, "height": 64}
     tab.evaluate(
@@ -548,7 +548,7 @@ def alpha_at(tab, x, y):
 def disc():
     """A compact disc of few pits."""
     small = {"tracks": 2, "length": 12.5, "patches": 2, "coherence_length": 4.0}
-    return Surface.named("compact_disc", small)
+    return ViewedSurface.named("compact_disc", small)
 
 
 @pytest.mark.slow
@@ -592,7 +592,8 @@ def shown_at(tab, point, back, distance):
 
 @pytest.mark.slow
 def test_a_sphere_casts_a_shadow_on_the_ground_and_mirrors_the_lamp(opened):
-    tab = opened(Surface.named("blazed", {"depth": 0.1, "samples": 64, "coherence_length": 3.0, "material": "Al"}))
+    parameters = {"depth": 0.1, "samples": 64, "coherence_length": 3.0, "material": "Al"}
+    tab = opened(ViewedSurface.named("blazed", parameters))
     elevation, distance = np.radians(40), 8
     back = np.array([0, -np.cos(elevation), np.sin(elevation)])
     # The light is 45° high, towards +x and then -x: the shadow of the centre of the sphere falls on the other side.
@@ -662,7 +663,7 @@ def test_the_scene_of_a_disc_has_its_rings(disc, opened, tmp_path, llvm):
 )
 def test_the_sky_is_that_of_a_path_tracer(source, parameters, changes, opened, tmp_path, llvm):
     """The picture of `view.xml` without a lamp: the mean XYZ of a plate, whose orders see other parts of the sky."""
-    tab = opened(Surface.named(source, parameters))
+    tab = opened(ViewedSurface.named(source, parameters))
     view = {"shape": "plate", "azimuth": -70, "elevation": 35, "distance": 2, "lightElevation": -80}
     tab.evaluate("(changes) => viewer.set(changes)", {"maxFrames": 64, "sky": 0.5, "hasBase": False, **view, **changes})
     wait_for_frames(tab)
@@ -681,7 +682,7 @@ def test_the_sky_is_that_of_a_path_tracer(source, parameters, changes, opened, t
 
 @pytest.fixture(scope="module")
 def cat():
-    return Surface.named(RECIPES / "designed" / "cat.toml", {"material": "Al"})
+    return ViewedSurface.named(RECIPES / "designed" / "cat.toml", {"material": "Al"})
 
 
 @pytest.mark.slow
@@ -716,7 +717,7 @@ def test_a_designed_plate_opens_with_its_picture_on_a_wall(cat, opened, tmp_path
 
 @pytest.mark.slow
 def test_a_reference_picture_is_compared(opened):
-    surface = Surface.named("blazed", {"depth": 0.1, "samples": 64, "coherence_length": 3.0})
+    surface = ViewedSurface.named("blazed", {"depth": 0.1, "samples": 64, "coherence_length": 3.0})
     grey = np.full((40, 40, 3), 0.5, np.float16)
     tab = opened(surface, picture=grey)
     tab.evaluate("viewer.set({ maxFrames: 1, right: 'picture', exposure: 0 })")
@@ -733,7 +734,7 @@ def test_colours_are_shown_as_in_previews(opened):
     lines = radiance_to_linear_sRGB(np.eye(81)[10:70:6], np.arange(380.0, 781.0, 5.0))
     light = np.concatenate([factor * lines / lines.max() for factor in (0.1, 1.0, 8.0)] + [np.full((1, 3), 0.5)])
     picture = np.tile(np.repeat(light, 4, 0), (200, 1, 1))
-    blaze = Surface.named("blazed", {"depth": 0.1, "samples": 64, "coherence_length": 3.0})
+    blaze = ViewedSurface.named("blazed", {"depth": 0.1, "samples": 64, "coherence_length": 3.0})
     tab = opened(blaze, picture=picture.astype(np.float16))
     tab.evaluate("viewer.set({ maxFrames: 1, right: 'picture', divider: 0, exposure: 0 })")
     wait_for_frames(tab)
@@ -768,11 +769,11 @@ def test_a_page_that_turns_has_no_controls(disc, opened):
 @pytest.mark.slow
 def test_new_heights_have_other_colours(opened):
     """Look-ups after a slider has moved, against those of a page that opens with these heights."""
-    surface = Surface.named(RECIPES / "elaphe_afm.toml", {})
+    surface = ViewedSurface.named(RECIPES / "elaphe_afm.toml", {})
     pairs = pairs_of(surface.spectrum, 200).ravel().tolist()
     found = []
     for height, changes in ((1.0, [0.6]), (1.0, []), (0.6, [])):
-        tab = opened(Surface.named(RECIPES / "elaphe_afm.toml", {"height_scale": height}))
+        tab = opened(ViewedSurface.named(RECIPES / "elaphe_afm.toml", {"height_scale": height}))
         for change in changes:
             tab.evaluate("(heightScale) => viewer.set({ heightScale, maxFrames: 1 })", change)
             wait_for_frames(tab)
@@ -783,7 +784,7 @@ def test_new_heights_have_other_colours(opened):
 
 @pytest.mark.slow
 def test_a_list_of_surfaces_shows_each(disc, opened):
-    blaze = Surface.named("blazed", {"depth": 0.1, "samples": 64, "coherence_length": 3.0, "material": "Au"})
+    blaze = ViewedSurface.named("blazed", {"depth": 0.1, "samples": 64, "coherence_length": 3.0, "material": "Au"})
     tab = opened(disc, blaze)
     names = ["compact_disc", "blazed"]
     assert tab.locator("#surface option").all_inner_texts() == names
@@ -804,7 +805,7 @@ def test_a_list_of_surfaces_shows_each(disc, opened):
 
 def test_a_browser_without_webgl2_is_told_in_one_line(browser, tmp_path):
     path = tmp_path / "page.html"
-    path.write_text(pages.page(Surface.named("blazed", {"depth": 0.1, "samples": 64})), encoding="utf-8")
+    path.write_text(pages.page(ViewedSurface.named("blazed", {"depth": 0.1, "samples": 64})), encoding="utf-8")
     tab = browser.new_page()
     tab.add_init_script("HTMLCanvasElement.prototype.getContext = () => null")
     tab.goto(path.as_uri())

@@ -17,7 +17,7 @@ from mitsuba_diffraction.optics.color import daylight, matching_functions
 from mitsuba_diffraction.precomputation.recipe import Recipe
 from mitsuba_diffraction.spectrum.tables import SliceTable
 from mitsuba_diffraction.viewer import page as pages
-from mitsuba_diffraction.viewer.viewed_surface import MAX_LAYERS, Surface
+from mitsuba_diffraction.viewer.viewed_surface import MAX_LAYERS, ViewedSurface
 
 RECIPES = Path(__file__).parents[2] / "precompute"
 SMALL = "blazed,depth=0.02,samples=32,coherence_length=2"
@@ -39,7 +39,7 @@ def test_a_page_is_written_and_opened_on_request(command, tmp_path, monkeypatch)
 @pytest.mark.parametrize("name", ["<!--<script>", "{{scripts}}", "a & b </script>"])
 def test_any_name_of_a_surface_is_only_its_name(name):
     # Regression: the first ended the page, and the second was replaced by the program.
-    surface = Surface.named("blazed", {"depth": 0.02, "samples": 32, "coherence_length": 2.0})
+    surface = ViewedSurface.named("blazed", {"depth": 0.02, "samples": 32, "coherence_length": 2.0})
     text = pages.page(dataclasses.replace(surface, name=name))
     assert html.unescape(re.search("<title>(.*)</title>", text)[1]) == name
     data = re.search('<script id="data" type="application/json">(.*)</script>', text)[1]
@@ -56,8 +56,8 @@ def test_a_page_of_a_film_says_that_it_shows_reflected_light(command, tmp_path, 
 
 
 def test_a_recipe_of_the_package_has_its_name_in_the_saved_scene_and_in_its_command():
-    assert Surface.named("elaphe_afm", {}).grating == {"filename": "elaphe_afm"}
-    changed = Surface.named("blaze", {"tolerance": 0.05, "coherence_length": 3.0})
+    assert ViewedSurface.named("elaphe_afm", {}).grating == {"filename": "elaphe_afm"}
+    changed = ViewedSurface.named("blaze", {"tolerance": 0.05, "coherence_length": 3.0})
     surface = "blaze,tolerance=0.05,coherence_length=3.0"
     assert changed.command == shell_command("mitsuba-diffraction", "precompute", surface, "-o", "blaze.exr")
 
@@ -65,7 +65,7 @@ def test_a_recipe_of_the_package_has_its_name_in_the_saved_scene_and_in_its_comm
 def test_a_name_with_a_hyphen_is_no_option_of_the_command(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     np.save("-o.npy", np.zeros((4, 4)))
-    shown = Surface.named("-o.npy", {"pixel_size": 0.05, "extent": "tile"})
+    shown = ViewedSurface.named("-o.npy", {"pixel_size": 0.05, "extent": "tile"})
     assert shown.command == "mitsuba-diffraction precompute ./-o.npy,pixel_size=0.05,extent=tile -o ./-o.exr"
 
 
@@ -100,10 +100,10 @@ def test_all_kinds_of_surfaces_are_shown(command, tmp_path, monkeypatch):
     ids=lambda path: path.stem,
 )
 def test_a_page_holds_everything_is_small_and_ready_within_three_seconds(recipe):
-    Surface.named(recipe, {})  # computes spectra that are not cached, such as that of a disc under its plastic
+    ViewedSurface.named(recipe, {})  # computes spectra that are not cached, such as that of a disc under its plastic
     # Of the processor, as a busy machine takes any time.
     start = time.process_time()
-    text = pages.page(Surface.named(recipe, {}))
+    text = pages.page(ViewedSurface.named(recipe, {}))
     assert time.process_time() - start < 3
     assert len(text.encode()) < pages.MAX_PAGE_BYTES
     assert not re.search(r"(src|href)\s*=\s*[\"'](?!data:)|https?://(?!www\.w3\.org)|@import|\{\{", text)
@@ -197,7 +197,7 @@ def test_a_page_and_a_scene_share_the_spectrum_of_a_disc(llvm, monkeypatch):
 
     monkeypatch.setattr(md.Recipe, "cached", cached)
     with pytest.raises(ValueError, match="asked"):
-        Surface.named("compact_disc", {})
+        ViewedSurface.named("compact_disc", {})
     with pytest.raises(RuntimeError, match="asked"):
         mi.load_dict({"type": "diffraction_grating", "profile": "compact_disc", "material": "Al", "coat_ior": 1.55})
     assert asked[0].settings == asked[1].settings
@@ -269,7 +269,7 @@ def test_a_page_asks_what_the_medium_below_is(tmp_path):
     surface = {"depth": 0.02, "samples": 32, "coherence_length": 2.0}
 
     def data(**material):
-        text = pages.page(Surface.named("blazed", {**surface, **material}))
+        text = pages.page(ViewedSurface.named("blazed", {**surface, **material}))
         return json.loads(re.search('<script id="data" type="application/json">(.*)</script>', text)[1])
 
     metal = data(material=str(tmp_path / "metal.csv"))

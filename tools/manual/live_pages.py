@@ -17,7 +17,7 @@ from mkdocs.config.defaults import MkDocsConfig
 from mkdocs.structure.files import File, Files
 
 from mitsuba_diffraction.viewer.page import page
-from mitsuba_diffraction.viewer.viewed_surface import Surface
+from mitsuba_diffraction.viewer.viewed_surface import ViewedSurface
 
 RECIPES = Path(__file__).parents[2] / "precompute"
 SURFACES = {
@@ -42,7 +42,7 @@ def live_page(name: str) -> str:
     surfaces = []
     for title, recipe, parameters in (SURFACES[one] for one in PAGES.get(name, (name,))):
         _log.info(f"live/{name}.html: {title}, which takes minutes unless its spectrum is cached")
-        surfaces.append(replace(Surface.named(RECIPES / recipe, parameters), name=title))
+        surfaces.append(replace(ViewedSurface.named(RECIPES / recipe, parameters), name=title))
     return page(*surfaces)
 
 

@@ -67,7 +67,7 @@ def main() -> None:
         with Image.open(FOLDER / f"snake_{name}_flss.jpg") as file:
             row[0].imshow(np.asarray(file))
         for panel, picture in zip(row[1:], (shader, traced), strict=True):
-            panel.imshow(shown(picture.xyz, pictures.surface), interpolation="lanczos")
+            panel.imshow(shown(picture.xyz, pictures.mask), interpolation="lanczos")
         row[0].set_ylabel(title, fontstyle="italic")
         for panel in row:
             panel.set(xticks=[], yticks=[])

@@ -32,7 +32,7 @@ from ...render.trace_pass import pass_seed, trace_pass
 from ...settings import ORIGINS, SERIES, ScalarSettings
 from ...shader_2014.comparison.difference import as_shown, white_luminance
 from ...shader_2014.comparison.pictures import Picture
-from ...shader_2014.surfaces import gratings_of
+from ...shader_2014.shaded_gratings import gratings_of
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure

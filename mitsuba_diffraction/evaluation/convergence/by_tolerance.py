@@ -150,13 +150,13 @@ def convergence(
     of = pictures(finest / 3, seed=1)
     with progress("reference") as bar:
         reference = of.path_traced(reference_samples, bar)
-    white = white_luminance(reference.xyz, of.surface)
+    white = white_luminance(reference.xyz, of.mask)
     points = []
 
     def errors(picture: Picture) -> tuple[float, float, float]:
-        delta_e = difference(reference.xyz, picture.xyz, of.surface, white)
-        wanted = as_shown(reference.xyz[of.surface] / white)[:, 1]
-        found = as_shown(picture.xyz[of.surface] * (delta_e.exposure / white))[:, 1]
+        delta_e = difference(reference.xyz, picture.xyz, of.mask, white)
+        wanted = as_shown(reference.xyz[of.mask] / white)[:, 1]
+        found = as_shown(picture.xyz[of.mask] * (delta_e.exposure / white))[:, 1]
         return picture.seconds, delta_e.mean, float(((found - wanted) ** 2).sum() / (wanted**2).sum())
 
     def add(name: str, traced: bool, count: int, rendered: Callable[[], Picture], source: Pictures) -> None:
@@ -187,8 +187,8 @@ def convergence(
     scene = " ".join(
         [os.path.basename(scene_path), *(f"-D {key}={value}" for key, value in (parameters or {}).items())]
     )
-    rows, columns = of.surface.shape
-    return Convergence(scene, (columns, rows), noise(reference.halves, of.surface, white), tuple(points))
+    rows, columns = of.mask.shape
+    return Convergence(scene, (columns, rows), noise(reference.halves, of.mask, white), tuple(points))
 
 
 def save_convergence_plot(found: Convergence, path: str | os.PathLike[str]) -> None:

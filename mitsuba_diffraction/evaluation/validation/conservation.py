@@ -79,20 +79,20 @@ def excess(bsdf: mi.BSDF) -> Record:
     return Record(np.maximum(max_albedo - 1, 0), 0.0, 1e-3 + _MAX_DEVIATIONS * error, note=note)
 
 
-_SURFACES = {
+_HEIGHT_FIELDS = {
     "sinusoid": gratings.sinusoidal(2.5, 0.3),
     "blaze": gratings.blazed(2.5, 0.25),
     "crossed": gratings.crossed(2.0, 0.1, samples=32),
 }
 
 
-def _measured(measure: Callable[[GratingSpectrum], Record], surface: HeightField) -> Record:
-    return measure(spectrum_of(surface, tolerance=1e-3))
+def _measured(measure: Callable[[GratingSpectrum], Record], height_field: HeightField) -> Record:
+    return measure(spectrum_of(height_field, tolerance=1e-3))
 
 
 CHECKS = tuple(
-    Check("energy", f"{name}: {what}", functools.partial(_measured, measure, surface), source, slow=True)
-    for name, surface in _SURFACES.items()
+    Check("energy", f"{name}: {what}", functools.partial(_measured, measure, height_field), source, slow=True)
+    for name, height_field in _HEIGHT_FIELDS.items()
     for what, measure, source in (
         ("reciprocity", reciprocity, "f(ω_i, ω_o) = f(ω_o, ω_i)"),
         ("albedo of a perfect mirror", energy, "at most one"),

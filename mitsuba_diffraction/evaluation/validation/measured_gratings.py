@@ -57,16 +57,16 @@ def littrow(name: str, facet_angle: float, wavelengths: Real, rigorous: bool) ->
         rigorous: the theory.
     """
     period, found = 1000 / LINES_PER_MM[name], []
-    surface = right_angled(period, facet_angle)
+    height_field = right_angled(period, facet_angle)
     for wavelength in wavelengths:
         index, sine = aluminium(wavelength), wavelength / (2 * period)
         if rigorous:
             harmonics = int(1.5 * period / wavelength) + 10
             direction = -sine, 0.0, np.sqrt(1 - sine**2)
-            orders = efficiencies(surface, direction, wavelength, int_ior=index, harmonics=harmonics).reflection
+            orders = efficiencies(height_field, direction, wavelength, int_ior=index, harmonics=harmonics).reflection
         else:
             angle = float(np.rad2deg(np.arcsin(sine)))
-            orders = scalar_orders(profile_powers(surface), period, wavelength, angle, index)
+            orders = scalar_orders(profile_powers(height_field), period, wavelength, angle, index)
         found.append(orders.unpolarised[orders.m == 1][0])
     return np.array(found)
 

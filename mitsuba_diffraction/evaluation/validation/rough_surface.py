@@ -62,8 +62,8 @@ def diffuse(q: Real, g: float, correlation: float, broadened: float = 0.0, even:
 
 @functools.cache
 def _spectrum(rms: float, correlation: float) -> GratingSpectrum:
-    surface = random_profile(rms, correlation)
-    return spectrum_of(surface, extent="sample", coherence_length=COHERENCE_LENGTH, tolerance=2e-3, **SETTINGS)
+    height_field = random_profile(rms, correlation)
+    return spectrum_of(height_field, extent="sample", coherence_length=COHERENCE_LENGTH, tolerance=2e-3, **SETTINGS)
 
 
 def _coherent(wavelength: float, angle: float) -> Record:

@@ -43,16 +43,16 @@ def groove(shape: str, angle: float) -> HeightField:
     return blazed(T300_PERIOD, T300_PERIOD * np.tan(np.deg2rad(angle)), samples=512)
 
 
-def transmitted(surface: HeightField, wavelength: float, rigorous: bool) -> Real:
+def transmitted(height_field: HeightField, wavelength: float, rigorous: bool) -> Real:
     """Compute η of the blazed orders 1 and 2, unpolarised light at normal incidence through the plane face."""
     index = b270(wavelength)
     if rigorous:
         # Fifteen harmonics more change the efficiencies by less than 1e-3.
         harmonics = int(2 * index * T300_PERIOD / wavelength) + 15
-        exact = efficiencies(surface, (0, 0, -1), wavelength, int_ior=index, tolerance=0.02, harmonics=harmonics)
+        exact = efficiencies(height_field, (0, 0, -1), wavelength, int_ior=index, tolerance=0.02, harmonics=harmonics)
         orders = exact.transmission
     else:
-        orders = transmitted_orders(profile_powers(surface), T300_PERIOD, wavelength, 0.0, index, from_below=True)
+        orders = transmitted_orders(profile_powers(height_field), T300_PERIOD, wavelength, 0.0, index, from_below=True)
     face = 1 - fresnel(1.0, index)[0]
     return face * np.array([orders.unpolarised[orders.m == -m][0] for m in (1, 2)])
 
@@ -60,8 +60,8 @@ def transmitted(surface: HeightField, wavelength: float, rigorous: bool) -> Real
 @functools.cache
 def curve(shape: str, angle: float, rigorous: bool, step: int = 1) -> Real:
     """Return η₁ at every `step`th measured wavelength."""
-    surface = groove(shape, angle)
-    return np.array([transmitted(surface, wavelength, rigorous)[0] for wavelength in measured("T300")[0][::step]])
+    height_field = groove(shape, angle)
+    return np.array([transmitted(height_field, wavelength, rigorous)[0] for wavelength in measured("T300")[0][::step]])
 
 
 def scaled(found: Real, step: int = 1) -> tuple[float, float]:
@@ -83,10 +83,10 @@ def t300_difference(shape: str, theory: str) -> Record:
 
 def ratios(shape: str, theory: str) -> Record:
     """Return the second order over the first at the wavelengths of `RATIOS`; `measured` is at the first."""
-    surface = groove(shape, stored_angles()[shape][theory])
+    height_field = groove(shape, stored_angles()[shape][theory])
     found = []
     for wavelength in RATIOS:
-        first, second = transmitted(surface, wavelength, theory == "rigorous")
+        first, second = transmitted(height_field, wavelength, theory == "rigorous")
         found.append(second / first)
     values = ", ".join(f"{value:.3f}" for value in found)
     at = ", ".join(f"{1e3 * wavelength:g}" for wavelength in RATIOS)

@@ -34,7 +34,7 @@ def shown(comparison: Comparison, name: str) -> NDArray[np.uint8]:
     exposure = (1 if found is None else found.exposure) / comparison.white
     xyz = comparison.pictures[name].xyz * exposure
     if not comparison.pigment:
-        xyz = np.where(comparison.surface[..., None], xyz, 0)
+        xyz = np.where(comparison.mask[..., None], xyz, 0)
     return on_screen(into_gamut(XYZ_to_linear_sRGB(xyz)))
 
 
@@ -87,7 +87,7 @@ def comparison_figure(comparison: Comparison, *, others: bool = False) -> Figure
     names = [f"{kind}_published" for kind in comparison.others] if others else ["path_traced", "published", "corrected"]
     columns = max(3, len(names))
     width = (_WIDTH - (columns + 1) * _GAP) / columns
-    height = width * comparison.surface.shape[0] / comparison.surface.shape[1]
+    height = width * comparison.mask.shape[0] / comparison.mask.shape[1]
     shares = None if others else comparison.shares
     causes = [] if shares is None else sorted(shares.visible(), key=lambda name: -shares.quirks[name].rise)
     causes = causes[:_MAX_CAUSES]

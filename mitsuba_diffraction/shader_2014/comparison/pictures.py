@@ -41,8 +41,8 @@ from ..diffraction_shader import PUBLISHED_BRIGHTNESS, checked_brightness, param
 from ..flss import FLSS
 from ..lights import lights_of
 from ..quirks import Quirks
+from ..shaded_gratings import gratings_of, sum_along
 from ..shader import Shader, TextureShader
-from ..surfaces import gratings_of, sum_along
 from ..tristimulus import EMISSION, emission_of_primaries
 
 
@@ -154,7 +154,7 @@ class Pictures:
     Attributes:
         scene: Mitsuba's.
         film_size: (width, height) of the whole film; a picture shows its crop window.
-        surface: (height, width) bool, the pixels covered by gratings.
+        mask: (height, width) bool, the pixels covered by gratings.
         shaders: of the gratings.
         spectra: of the gratings.
         has_base: whether something lies below a grating.
@@ -216,7 +216,7 @@ class Pictures:
         self._others: dict[tuple[bool, bool, int], Picture] = {}
         self.use(shader)
         self.film_size = tuple(int(size) for size in self.scene.sensors()[0].film().size())
-        self.surface = shows_gratings(self.scene, across=4)
+        self.mask = shows_gratings(self.scene, across=4)
 
     def use(self, shader: str) -> None:
         """Choose the shader, one of `VARIANTS`, of the next pictures."""
@@ -354,7 +354,7 @@ class Pictures:
             self._colours(colour, count, index, part(progress, index / len(counts), (index + 1) / len(counts)))
             for index, count in enumerate(counts)
         ]
-        mean = float(np.mean([rgb[self.surface] @ LUMINANCE for rgb, _ in parts]))
+        mean = float(np.mean([rgb[self.mask] @ LUMINANCE for rgb, _ in parts]))
         if luminance is not None and not mean > 0:
             raise RequestError(f"brightness: got diffraction of the mean luminance {mean:.3g}, wanted a positive one")
         scale = 1.0 if luminance is None else luminance / mean
@@ -375,7 +375,7 @@ class Pictures:
         seed: int | None = None,
     ) -> Picture:
         seed = self.seed if seed is None else seed
-        rows, columns = self.surface.shape
+        rows, columns = self.mask.shape
         passes = split(self.scene, samples, 2 if halves else 1)
         check_memory(self.scene, max(passes))
         trace_pass(self.scene, 1, seed, integrator)  # compiles the kernels
@@ -397,7 +397,7 @@ class Pictures:
         self, colour: ColourOfRay, samples: int, half: int, progress: Progress
     ) -> tuple[NDArray[np.float64], float]:
         """Return linear sRGB of the gratings, (height, width, 3), and seconds; `half` selects the random numbers."""
-        rows, columns = self.surface.shape
+        rows, columns = self.mask.shape
         per_dispatch = max(1, _MAX_POINTS_PER_DISPATCH // samples)
         firsts = range(0, rows * columns, per_dispatch)
         # Compiles the kernels. With two pixels, as Dr.Jit compiles other kernels for a single sample.
@@ -411,7 +411,7 @@ class Pictures:
 
     def _averaged(self, points: list[NDArray[np.float32]]) -> NDArray[np.float64]:
         """Return the means over the pixels, (height, width, 3), of `_shade`, with equally many points per pixel."""
-        rows, columns = self.surface.shape
+        rows, columns = self.mask.shape
         x, y, *rgb = (on_device(column) for column in np.concatenate(points, axis=1))
         channels = [dr.opaque(mi.Float, channel, shape=len(x)) for channel in range(3)]
         rfilter = self.scene.sensors()[0].film().rfilter()

@@ -68,21 +68,21 @@ def quirk_shares(pictures: Pictures, samples: int, shading_points: int, progress
     done, total = 1, 2 * len(names) + 3
     reference = pictures.same_light(shading_points, samples)
     progress(1, total)
-    white = white_luminance(reference.xyz, pictures.surface)
+    white = white_luminance(reference.xyz, pictures.mask)
 
     def distance(*quirks: str) -> float:
         nonlocal done
         xyz = pictures.shaded(quirks, shading_points, samples).xyz
         done += 1
         progress(done, total)
-        return difference(reference.xyz, xyz, pictures.surface, white).mean
+        return difference(reference.xyz, xyz, pictures.mask, white).mean
 
     published, corrected = distance(*names), distance()
     found = {}
     for name in names:
         drop, rise = published - distance(*(other for other in names if other != name)), distance(name) - corrected
         found[name] = QuirkShare(drop, rise, (drop + rise) / 2 / published)
-    rows, columns = pictures.surface.shape
+    rows, columns = pictures.mask.shape
     return QuirkShares(
         (columns, rows),
         samples,

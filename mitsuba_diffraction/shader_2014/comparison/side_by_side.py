@@ -45,7 +45,7 @@ class Comparison:
             "published" and "corrected" (the shader with and without its quirks), and for each of `others`, such as nmm,
             "nmm_published" and "nmm_corrected".
         pigment: whether what lies below the gratings is shown, in all pictures alike.
-        surface: (height, width) bool, the pixels that are compared: those covered by gratings.
+        mask: (height, width) bool, the pixels that are compared: those covered by gratings.
         white: the luminance that is shown as white.
         to_path_traced: difference of each other picture from the path-traced one.
         to_same_light: difference of the shader's pictures from "same_light", at the same points.
@@ -70,7 +70,7 @@ class Comparison:
     seed: int
     pictures: Mapping[str, Picture]
     pigment: bool
-    surface: NDArray[np.bool_]
+    mask: NDArray[np.bool_]
     white: float
     to_path_traced: Mapping[str, Difference]
     to_same_light: Mapping[str, Difference]
@@ -190,12 +190,12 @@ def compare(
     with progress("path tracer") as bar:
         pictures = {"path_traced": of.path_traced(request.spp, bar)}
     reference = pictures["path_traced"].xyz
-    white = white_luminance(reference, of.surface)
+    white = white_luminance(reference, of.mask)
     few_samples = _few_samples(request, of, reference, white)
     with progress("the same light") as bar:
         pictures["same_light"] = of.same_light(request.shading_points, request.spp, bar)
     reads, truncated_fraction, series_error = _add_shaded(pictures, request, of, progress)
-    to = functools.partial(_differences, pictures, of.surface, white)
+    to = functools.partial(_differences, pictures, of.mask, white)
     return Comparison(
         scene=Path(request.scene).name,
         shader=request.shader,
@@ -205,12 +205,12 @@ def compare(
         seed=request.seed,
         pictures=pictures,
         pigment=request.pigment,
-        surface=of.surface,
+        mask=of.mask,
         white=white,
         to_path_traced=to("path_traced", [name for name in pictures if name != "path_traced"]),
         to_same_light=to("same_light", reads),
         few_samples=few_samples,
-        noise={name: noise(picture.halves, of.surface, white) for name, picture in pictures.items()},
+        noise={name: noise(picture.halves, of.mask, white) for name, picture in pictures.items()},
         shader_reads=reads,
         model_reads=of.model_reads,
         truncated_fraction=truncated_fraction,
@@ -223,10 +223,10 @@ def compare(
 
 
 def _differences(
-    pictures: Mapping[str, Picture], surface: NDArray[np.bool_], white: float, reference: str, names: Iterable[str]
+    pictures: Mapping[str, Picture], mask: NDArray[np.bool_], white: float, reference: str, names: Iterable[str]
 ) -> dict[str, Difference]:
     """Return the differences of pictures from the one called `reference`."""
-    return {name: difference(pictures[reference].xyz, pictures[name].xyz, surface, white) for name in names}
+    return {name: difference(pictures[reference].xyz, pictures[name].xyz, mask, white) for name in names}
 
 
 def _few_samples(
@@ -236,7 +236,7 @@ def _few_samples(
     found = []
     for count in (count for count in FEW_SAMPLES if count < request.spp):
         few = of.path_traced(count, seed=request.seed + 1)
-        found.append((count, few.seconds, difference(reference, few.xyz, of.surface, white).mean))
+        found.append((count, few.seconds, difference(reference, few.xyz, of.mask, white).mean))
     return tuple(found)
 
 
@@ -266,7 +266,7 @@ def _shares(
     request: ComparisonRequest, of: Pictures, progress: Callable[[str], AbstractContextManager[Progress]]
 ) -> QuirkShares:
     """Return the fractions of the difference due to each quirk, from small pictures."""
-    scale = min(1.0, request.shares_side / max(of.surface.shape))
+    scale = min(1.0, request.shares_side / max(of.mask.shape))
     columns, rows = (max(1, round(size * scale)) for size in of.film_size)
     small = request.pictures(columns, rows)
     with progress("quirks") as bar:

@@ -88,9 +88,9 @@ def quirk_table(shares: QuirkShares) -> Table:
 
 def notes(comparison: Comparison) -> list[str]:
     """Return explanations of the tables, one line each."""
-    rows, columns = comparison.surface.shape
+    rows, columns = comparison.mask.shape
     lines = [
-        f"compared: the {100 * comparison.surface.mean():.0f} % of {columns} × {rows} pixels that show only gratings; "
+        f"compared: the {100 * comparison.mask.mean():.0f} % of {columns} × {rows} pixels that show only gratings; "
         f"Y = {comparison.white:.4g} is white; one exposure factor gives a picture the mean luminance of its reference",
         "gratings are shown with what lies below them"
         if comparison.pigment
@@ -154,8 +154,8 @@ _NUMBERS = ("exposure", "mean", "percentile_95", "max", "luminance_error")
 def as_dict(comparison: Comparison) -> dict[str, object]:
     """Return all numbers by the names of the attributes, for `outputs.save_json`."""
     found = {field.name: getattr(comparison, field.name) for field in dataclasses.fields(comparison)}
-    surface = found.pop("surface")
-    found |= {"size": surface.shape[::-1], "compared": float(surface.mean())}
+    mask = found.pop("mask")
+    found |= {"size": mask.shape[::-1], "compared": float(mask.mean())}
     found["pictures"] = {
         name: {"samples": picture.samples, "seconds": picture.seconds, "brightness": picture.brightness}
         for name, picture in comparison.pictures.items()
