@@ -38,7 +38,7 @@ BLOCK = re.compile(r"^(?P<indent> *)```(?P<language>\w+)\n(?P<body>.*?)^ *```$",
 REDUCED = {
     "design": {"--texels": "8", "--starts": "1"},
     "render": {"--width": "16", "--spp": "1"},
-    "compare": {"--width": "16", "--spp": "1", "--no-shares": None},
+    "compare": {"--width": "16", "--spp": "1", "--no-costs": None},
 }
 """Options that make a command quick, instead of those that it has."""
 SHOWN = {"text", "bash", "math", "js"}

@@ -60,7 +60,7 @@ LINES = (
     "render scene.xml -o picture.exr --spp 4 --checkpoint 0",
     "design target.png --texels 16 --texel 1 --wavelength 532 --starts 1 -o plate.gsf",
     "hologram target.png -o hologram",
-    "compare scene.xml --spp 4 --width 8 --no-shares -o compared",
+    "compare scene.xml --spp 4 --width 8 --no-costs -o compared",
     "benchmark --surface blazed --tolerance 0.1 --json benchmark.json",
     "convergence scene.xml --terms 6,12 --width 8 --spp 4 -o terms.png",
     "validate blazed",

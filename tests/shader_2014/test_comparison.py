@@ -18,7 +18,7 @@ from mitsuba_diffraction.render.spectral_film import channel_wavelengths, channe
 from mitsuba_diffraction.shader_2014.comparison import ComparisonRequest, compare, figure, summary
 from mitsuba_diffraction.shader_2014.comparison.difference import difference, noise, time_of_error, white_luminance
 from mitsuba_diffraction.shader_2014.comparison.pictures import NO_SHADOWS, Pictures, supported_lights
-from mitsuba_diffraction.shader_2014.comparison.quirk_shares import quirk_shares
+from mitsuba_diffraction.shader_2014.comparison.quirk_costs import quirk_costs
 from mitsuba_diffraction.shader_2014.evaluate import VARIANTS
 from mitsuba_diffraction.shader_2014.quirks import Quirks
 
@@ -299,12 +299,12 @@ def test_a_crop_window_is_compared_alone(llvm, tmp_path):
 
 
 @pytest.mark.slow
-def test_the_share_of_a_quirk_is_that_of_renderings_without_it(llvm, tmp_path):
+def test_the_cost_of_a_quirk_is_that_of_renderings_without_it(llvm, tmp_path):
     pictures = Pictures(write(tmp_path / "scene.xml", SUN + SKY), "gem", width=8)
     names = ("constant_blend", NO_SHADOWS)
     assert sorted(pictures.quirks) == sorted(names)
     steps = []
-    found = quirk_shares(pictures, 16, 4, lambda done, total: steps.append((done, total)))
+    found = quirk_costs(pictures, 16, 4, lambda done, total: steps.append((done, total)))
     assert steps == [(i + 1, 7) for i in range(7)]
     assert found.size == (8, 6)
     reference = pictures.same_light(4, 16)
@@ -318,7 +318,7 @@ def test_the_share_of_a_quirk_is_that_of_renderings_without_it(llvm, tmp_path):
     one = found.quirks["constant_blend"]
     assert one.drop == pytest.approx(mean(*names) - mean(NO_SHADOWS))
     assert one.rise == pytest.approx(mean("constant_blend") - mean())
-    assert one.share == pytest.approx((one.drop + one.rise) / 2 / mean(*names))
+    assert one.fraction == pytest.approx((one.drop + one.rise) / 2 / mean(*names))
     # The sphere casts a shadow on the plate.
     shadow = found.quirks[NO_SHADOWS]
     assert shadow.rise == pytest.approx(mean(NO_SHADOWS) - mean())
@@ -360,8 +360,8 @@ def test_compare_writes_pictures_numbers_and_a_figure(command, llvm, folder):
     assert f"{found['mean']:.2f}" in out
     assert f"{found['exposure']:.3g}" in out
     assert 0 < found["mean"] <= found["percentile_95"] <= found["max"]
-    assert numbers["shares"]["size"] == [12, 9]
-    assert {*numbers["shares"]["quirks"][NO_SHADOWS]} == {"drop", "rise", "share"}
+    assert numbers["costs"]["size"] == [12, 9]
+    assert {*numbers["costs"]["quirks"][NO_SHADOWS]} == {"drop", "rise", "fraction"}
     assert NO_SHADOWS in out
     assert "constant_blend" not in out  # nothing is blended without pigment
     brightness = numbers["pictures"]["published"]["brightness"]
@@ -388,7 +388,7 @@ def test_compare_writes_pictures_numbers_and_a_figure(command, llvm, folder):
 def test_a_coat_is_noted(llvm, folder):
     write(Path("scene.xml"), base=BASE + '<float name="coat_ior" value="1.5"/>')
     small = {"width": 4, "spp": 1, "shading_points": 1}
-    request = ComparisonRequest("scene.xml", "flss", **small, shares=False, brightness=1000, pigment=True)
+    request = ComparisonRequest("scene.xml", "flss", **small, costs=False, brightness=1000, pigment=True)
     found = compare(request)
     assert found.coated
     for coated in (True, False):
@@ -402,7 +402,7 @@ def test_a_coat_is_noted(llvm, folder):
 def test_several_shaders_are_compared_with_their_options(llvm, folder):
     write(Path("scene.xml"))
     settings = {"terms": 6, "window": "texel", "width": 16, "spp": 2, "shading_points": 2}
-    found = compare(ComparisonRequest("scene.xml", "gem", ("flss",), **settings, shares=False))
+    found = compare(ComparisonRequest("scene.xml", "gem", ("flss",), **settings, costs=False))
     assert [*found.pictures] == [
         *("path_traced", "same_light", "published", "corrected", "flss_published", "flss_corrected"),
     ]
@@ -425,16 +425,16 @@ def test_several_shaders_are_compared_with_their_options(llvm, folder):
 @pytest.mark.slow
 def test_the_same_seed_gives_the_same_numbers(llvm, folder):
     write(Path("scene.xml"), rfilter="gaussian")
-    request = ComparisonRequest("scene.xml", "gem", spp=16, seed=1, shares=False)
+    request = ComparisonRequest("scene.xml", "gem", spp=16, seed=1, costs=False)
     found = [compare(request) for _ in range(2)]
     for first, second in zip(*(one.pictures.values() for one in found), strict=True):
         np.testing.assert_array_equal(first.image.radiance, second.image.radiance)
     numbers = [summary.as_dict(one) for one in found]
-    assert numbers[0]["shares"] is None
+    assert numbers[0]["costs"] is None
     for one in numbers:
         del one["pictures"], one["few_samples"]  # seconds
     assert numbers[0] == numbers[1]
-    # There is a figure without the shares, too.
+    # There is a figure without the costs, too.
     figure.save_figure(found[0], "figure.png")
     with Image.open("figure.png") as picture:
         assert picture.width == 1600
@@ -450,7 +450,7 @@ def test_lights_that_the_shader_supports_are_found():
 def test_a_recipe_is_compared_on_the_objects_of_a_scene(command, llvm, folder):
     recipe = '[surface]\nprofile = "blazed"\nperiod = 2.5\ndepth = 0.2\n[spectrum]\ncoherence_length = 3\n'
     Path("skin.toml").write_text(recipe)
-    code, _, err = command("compare skin.toml --shader gem --spp 2 --width 12 --no-shares")
+    code, _, err = command("compare skin.toml --shader gem --spp 2 --width 12 --no-costs")
     assert code == 0, err
     assert "note: the shader does not know the lights of scan.xml: light=parallel, of bulb, parallel, sun" in err
     assert names() == {"skin.toml", "skin-gem.png", *(f"skin-gem-{p}.exr" for p in ("path", "published", "corrected"))}
@@ -508,7 +508,7 @@ def test_a_failed_comparison_leaves_no_files(command, monkeypatch, llvm, folder,
         raise error
 
     monkeypatch.setattr(figure, "save_figure", fail)
-    code, out, err = command("compare scene.xml --shader gem --spp 1 --width 4 --no-shares")
+    code, out, err = command("compare scene.xml --shader gem --spp 1 --width 4 --no-costs")
     assert (code, out) == (130 if isinstance(error, KeyboardInterrupt) else 1, "")
     assert len(err.splitlines()) == 1
     assert names() == {"scene.xml"}

@@ -51,7 +51,7 @@ class CompareRequest:
     shading_points: Annotated[int, typer.Option(min=1, help="shading points per pixel of the shader")] = 4
     width: Annotated[int | None, typer.Option(min=1, help="pixels; default: that of the scene")] = None
     height: Annotated[int | None, typer.Option(min=1, help="pixels; default: that of the scene")] = None
-    shares: Annotated[bool, typer.Option(help="measure the cost of each quirk of the shader")] = True
+    costs: Annotated[bool, typer.Option(help="measure the cost of each quirk of the shader")] = True
     variant: Variant = None
     seed: Annotated[int, typer.Option(min=0, help="seed of the random numbers")] = 0
     json: Annotated[Path | None, typer.Option(help="save the numbers (.json)")] = None
@@ -111,7 +111,7 @@ class CompareRequest:
             shading_points=self.shading_points,
             seed=self.seed,
             parameters=scene_file.parameters,
-            shares=self.shares,
+            costs=self.costs,
         )
 
 
@@ -142,7 +142,7 @@ def compare(request: CompareRequest) -> None:
             figure.save_figure(found, files.enter_context(whole_file(target)), others=is_others)
         if request.json is not None:
             save_json(summary.as_dict(found), files.enter_context(whole_file(request.json)))
-    of_quirks = () if found.shares is None else (summary.quirk_table(found.shares),)
+    of_quirks = () if found.costs is None else (summary.quirk_table(found.costs),)
     show(summary.picture_table(found), *of_quirks, width=120)
     tell("\n" + "\n".join(summary.notes(found)))
     written = [*images, *figures, *([] if request.json is None else [str(request.json)])]

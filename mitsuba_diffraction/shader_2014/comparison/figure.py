@@ -88,8 +88,8 @@ def comparison_figure(comparison: Comparison, *, others: bool = False) -> Figure
     columns = max(3, len(names))
     width = (_WIDTH - (columns + 1) * _GAP) / columns
     height = width * comparison.mask.shape[0] / comparison.mask.shape[1]
-    shares = None if others else comparison.shares
-    causes = [] if shares is None else sorted(shares.visible(), key=lambda name: -shares.quirks[name].rise)
+    costs = None if others else comparison.costs
+    causes = [] if costs is None else sorted(costs.visible(), key=lambda name: -costs.quirks[name].rise)
     causes = causes[:_MAX_CAUSES]
     bars = 0.42 * len(causes) + 0.6 if causes else 0.0
     total = 0.6 + 3 * height + 2 * _GAP + 1.5 + bars
@@ -126,11 +126,11 @@ def comparison_figure(comparison: Comparison, *, others: bool = False) -> Figure
     bar.ax.tick_params(labelsize=_TEXT)
     words = "difference of colour, CIEDE2000, and its mean"
     result.text((width + 3 * _GAP) / _WIDTH, 1 - (below + 0.08) / total, words, fontsize=_TEXT, va="center")
-    if shares is not None and causes:
+    if costs is not None and causes:
         axes = panel(0, below + 1.15, _WIDTH, bars - 0.7)
         box = axes.get_position()
         axes.set_position((0.27, box.y0, 0.62, box.height))
-        values = [shares.quirks[name].rise for name in causes]
+        values = [costs.quirks[name].rise for name in causes]
         axes.bar_label(axes.barh(range(len(causes)), values, color="C0"), fmt="%.1f", fontsize=_TEXT, padding=6)
         axes.set_yticks(range(len(causes)), [CAUSES[name] for name in causes], fontsize=_TEXT)
         axes.tick_params(axis="y", length=0)

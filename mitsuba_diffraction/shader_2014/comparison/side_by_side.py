@@ -19,7 +19,7 @@ from ..diffraction_shader import parameters_of_variant
 from ..evaluate import VARIANTS
 from .difference import Difference, difference, noise, time_of_error, white_luminance
 from .pictures import Picture, Pictures
-from .quirk_shares import QuirkShares, quirk_shares
+from .quirk_costs import QuirkCosts, quirk_costs
 
 # The effect of quirks is measured in small pictures with little noise: 25 take about a minute on two cores.
 QUIRKS_MAX_SIDE = 72
@@ -59,7 +59,7 @@ class Comparison:
         samples: whether a surface is a scan, a piece of an irregular surface.
         patches: maximum number of patches over which this model averages; the shader has the first.
         coated: whether a grating has a coat, which the shader does not show.
-        shares: fractions of the difference due to each quirk; None if not requested.
+        costs: fractions of the difference due to each quirk; None if not requested.
     """
 
     scene: str
@@ -83,7 +83,7 @@ class Comparison:
     samples: bool
     patches: int
     coated: bool
-    shares: QuirkShares | None
+    costs: QuirkCosts | None
 
     def time_of_error(self, name: str) -> float:
         """Return the seconds after which the path tracer has the mean CIEDE2000 of a picture; NaN if not measured."""
@@ -111,8 +111,8 @@ class ComparisonRequest:
         shading_points: per pixel of the shader, each with its whole spectrum.
         seed: of the random numbers, not negative.
         parameters: values for the scene's `$name` parameters.
-        shares: measure the fraction of the difference that is due to each quirk.
-        shares_side: the longer side, in pixels, of the pictures for `shares`; limited to the longer side of the
+        costs: measure the fraction of the difference that is due to each quirk.
+        costs_side: the longer side, in pixels, of the pictures for `costs`; limited to the longer side of the
             picture.
     """
 
@@ -130,11 +130,11 @@ class ComparisonRequest:
     shading_points: int = 4
     seed: int = 0
     parameters: Mapping[str, str] = field(default_factory=dict)
-    shares: bool = True
-    shares_side: int = QUIRKS_MAX_SIDE
+    costs: bool = True
+    costs_side: int = QUIRKS_MAX_SIDE
 
     def __post_init__(self) -> None:
-        for name in ("spp", "shading_points", "shares_side"):
+        for name in ("spp", "shading_points", "costs_side"):
             if (count := getattr(self, name)) < 1:
                 raise RequestError(f"{name}: got {count}, wanted a positive number")
         for kind in self.shaders:  # before a spectrum is computed
@@ -218,7 +218,7 @@ def compare(
         samples=of.has_samples,
         patches=of.patches,
         coated=of.has_coat,
-        shares=_shares(request, of, progress) if request.shares else None,
+        costs=_costs(request, of, progress) if request.costs else None,
     )
 
 
@@ -262,12 +262,12 @@ def _add_shaded(
     return reads, *found[request.shader]
 
 
-def _shares(
+def _costs(
     request: ComparisonRequest, of: Pictures, progress: Callable[[str], AbstractContextManager[Progress]]
-) -> QuirkShares:
+) -> QuirkCosts:
     """Return the fractions of the difference due to each quirk, from small pictures."""
-    scale = min(1.0, request.shares_side / max(of.mask.shape))
+    scale = min(1.0, request.costs_side / max(of.mask.shape))
     columns, rows = (max(1, round(size * scale)) for size in of.film_size)
     small = request.pictures(columns, rows)
     with progress("quirks") as bar:
-        return quirk_shares(small, QUIRKS_SAMPLES, QUIRKS_SHADING_POINTS, bar)
+        return quirk_costs(small, QUIRKS_SAMPLES, QUIRKS_SHADING_POINTS, bar)

@@ -10,7 +10,7 @@ from rich.table import Table
 from ...progress import cells, table
 from ..diffraction_shader import PUBLISHED_BRIGHTNESS
 from .pictures import NO_SHADOWS
-from .quirk_shares import MIN_EFFECT, QuirkShares
+from .quirk_costs import MIN_EFFECT, QuirkCosts
 from .side_by_side import Comparison
 
 CAUSES = {
@@ -77,13 +77,13 @@ def picture_table(comparison: Comparison) -> Table:
     return table(("picture", *columns), rows)
 
 
-def quirk_table(shares: QuirkShares) -> Table:
+def quirk_table(costs: QuirkCosts) -> Table:
     """Return a table of the visible quirks, largest fraction first, for a terminal."""
     rows = []
-    for name in shares.visible():
-        one = shares.quirks[name]
-        rows.append([name, CAUSES[name], f"{one.drop:+.2f}", f"{one.rise:+.2f}", f"{one.share:.0%}"])
-    return table(("quirk", "cause", "drop", "rise", "share"), rows)
+    for name in costs.visible():
+        one = costs.quirks[name]
+        rows.append([name, CAUSES[name], f"{one.drop:+.2f}", f"{one.rise:+.2f}", f"{one.fraction:.0%}"])
+    return table(("quirk", "cause", "drop", "rise", "fraction"), rows)
 
 
 def notes(comparison: Comparison) -> list[str]:
@@ -129,20 +129,20 @@ def notes(comparison: Comparison) -> list[str]:
         lines.append(f"patches: this model is the mean over {comparison.patches} of them, the shader has the first")
     if comparison.series_error is not None and comparison.series_error > 0.01:
         lines.append(f"terms: the Taylor series of the corrected shader has an error of {comparison.series_error:.1g}")
-    if (shares := comparison.shares) is not None:
+    if (costs := comparison.costs) is not None:
         lines.append(
-            f"quirks: pictures of {shares.size[0]} × {shares.size[1]} pixels, {shares.samples} samples, "
-            f"{shares.shading_points} shading points"
+            f"quirks: pictures of {costs.size[0]} × {costs.size[1]} pixels, {costs.samples} samples, "
+            f"{costs.shading_points} shading points"
         )
         lines.append(
-            f"quirks, mean ΔE00 to same light: {shares.published:.2f} as published, {shares.corrected:.2f} corrected"
+            f"quirks, mean ΔE00 to same light: {costs.published:.2f} as published, {costs.corrected:.2f} corrected"
         )
-        if below := [name for name in shares.quirks if name not in shares.visible()]:
+        if below := [name for name in costs.quirks if name not in costs.visible()]:
             lines.append(f"quirks whose drop and rise are at most {MIN_EFFECT:g}: {', '.join(below)}")
         lines += [
             "drop: decrease of the published shader's mean ΔE00 with this quirk alone corrected",
             "rise: increase of the corrected shader's mean ΔE00 with this quirk alone added",
-            "share: the mean of both, as a fraction of the published shader's mean ΔE00; shares do not add up to one",
+            "fraction: the mean of both over the mean ΔE00 of the published shader; fractions do not add up to one",
         ]
     return lines
 

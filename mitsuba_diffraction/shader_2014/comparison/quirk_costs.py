@@ -12,23 +12,23 @@ MIN_EFFECT = 0.5
 
 
 @dataclass(frozen=True)
-class QuirkShare:
+class QuirkCost:
     """One quirk.
 
     Attributes:
         drop: of the mean CIEDE2000 of the published shader, when this quirk alone is corrected.
         rise: of the mean CIEDE2000 of the corrected shader, when this quirk alone is added.
-        share: (drop + rise)/2 over the mean CIEDE2000 of the published shader.
+        fraction: (drop + rise)/2 over the mean CIEDE2000 of the published shader.
     """
 
     drop: float
     rise: float
-    share: float
+    fraction: float
 
 
 @dataclass(frozen=True)
-class QuirkShares:
-    """Fractions of the difference due to each quirk.
+class QuirkCosts:
+    """Effect of each quirk on the difference.
 
     `drop` is the effect of a quirk in the presence of all others, `rise` its effect alone; the fraction is the mean of
     both, relative to the difference. Fractions do not add up to one, and may be negative: two quirks may cancel, or one
@@ -48,14 +48,14 @@ class QuirkShares:
     shading_points: int
     published: float
     corrected: float
-    quirks: dict[str, QuirkShare]
+    quirks: dict[str, QuirkCost]
 
     def visible(self) -> list[str]:
         """Return the names of the quirks whose drop or rise exceeds `MIN_EFFECT`."""
         return [name for name, one in self.quirks.items() if max(abs(one.drop), abs(one.rise)) > MIN_EFFECT]
 
 
-def quirk_shares(pictures: Pictures, samples: int, shading_points: int, progress: Progress = silent) -> QuirkShares:
+def quirk_costs(pictures: Pictures, samples: int, shading_points: int, progress: Progress = silent) -> QuirkCosts:
     """Render the shader with each single quirk corrected, and with each single quirk added.
 
     Args:
@@ -81,13 +81,13 @@ def quirk_shares(pictures: Pictures, samples: int, shading_points: int, progress
     found = {}
     for name in names:
         drop, rise = published - distance(*(other for other in names if other != name)), distance(name) - corrected
-        found[name] = QuirkShare(drop, rise, (drop + rise) / 2 / published)
+        found[name] = QuirkCost(drop, rise, (drop + rise) / 2 / published)
     rows, columns = pictures.mask.shape
-    return QuirkShares(
+    return QuirkCosts(
         (columns, rows),
         samples,
         shading_points,
         published=published,
         corrected=corrected,
-        quirks=dict(sorted(found.items(), key=lambda item: item[1].share, reverse=True)),
+        quirks=dict(sorted(found.items(), key=lambda item: item[1].fraction, reverse=True)),
     )
