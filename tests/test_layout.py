@@ -173,6 +173,22 @@ def test_a_word_of_names_has_one_meaning():
         assert f"`{word}`" in table
 
 
+@pytest.mark.quick
+def test_properties_of_mitsuba_stop_at_the_door():
+    """`GratingRequest` has what a scene says of a grating; plugins have theirs, and `render` those of parsed scenes."""
+    plugins = {"bsdf.diffraction_grating", "integrator.diffraction_path", "shader_2014.diffraction_shader"}
+    found = set()
+    for module, path in MODULES.items():
+        arguments = (node for node in ast.walk(ast.parse(path.read_text("utf-8"))) if isinstance(node, ast.arg))
+        if any(each.annotation and "mi.Properties" in ast.unparse(each.annotation) for each in arguments):
+            found.add(module.partition(".")[2])
+    assert {name for name in found if not name.startswith("render.")} == {
+        "bsdf.parameters",
+        "registration.plugins",
+        *plugins,
+    }
+
+
 def changed_arguments(path):
     """Lines that change an argument by an operator such as `&=`, before the function assigns anything to its name."""
     for function in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):

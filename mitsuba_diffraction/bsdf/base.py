@@ -50,22 +50,13 @@ def gratings_in(bsdf: mi.BSDF | None) -> list[mi.BSDF]:
     return [bsdf] * is_grating(bsdf) + [grating for part in parts(bsdf, mi.BSDF) for grating in gratings_in(part)]
 
 
-def base_from(props: mi.Properties) -> Base | None:
-    """Return the nested BSDF of the parameter `base`, or None.
+def base_from(given: Any) -> Base:
+    """Return the base given by a nested BSDF, a reflectance or a colour.
 
     Raises:
-        RequestError: if it is not a BSDF that reflects and does not transmit, a reflectance or a colour, or has another
-            name.
+        RequestError: if it is not a BSDF that reflects and does not transmit, a reflectance or a colour.
     """
-    others = [name for name, value in props.objects() if name != "base" and isinstance(value, mi.BSDF)]
-    if others:
-        raise RequestError(
-            'base: got a nested BSDF without this name, wanted <bsdf name="base" …> (in load_dict, the key "base")'
-        )
-    if "base" not in props:
-        return None
-    bsdf = props["base"]
-    return Base(bsdf if isinstance(bsdf, mi.BSDF) else _diffuse(bsdf))
+    return Base(given if isinstance(given, mi.BSDF) else _diffuse(given))
 
 
 def _diffuse(value: Any) -> mi.BSDF:

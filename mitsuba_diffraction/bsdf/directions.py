@@ -1,6 +1,6 @@
 """Wave vectors, pairs of them, and the incident light at one wavelength, with the formulas of `../optics/geometry.py`.
 
-All lengths are in units that make the lateral scale of the relief one (`Scales` in `parameters.py`).
+All lengths are in units that make the lateral scale of the relief one (`Scales` in `varying.py`).
 
 A coat and the flat face of a sheet are plane layers. They keep the tangential component of k = n ω and change the
 normal one, so that k next to the relief follows from k outside. κ has a sign: as S(q; −κ) = S(−q; κ), the tables for κ

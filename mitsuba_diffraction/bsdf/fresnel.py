@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from typing import Any, TypeAlias
 
 import drjit as dr
@@ -87,39 +88,39 @@ class Boundary:
         """Show the parameters."""
 
 
-def below_from(props: mi.Properties) -> MediumBelow:
-    """Return the medium given by `int_ior`, `material`, or `eta` and `k`.
+def below_from(given: Mapping[str, Any]) -> MediumBelow:
+    """Return the medium given by `int_ior`, `material`, or `eta` and `k` of a scene.
 
     Raises:
         RequestError: if they contradict each other or are unknown.
     """
-    own = [name for name in ("eta", "k") if name in props]
-    if "material" not in props and not own:
-        return MediumBelow("int_ior", index_from("int_ior", props.get("int_ior", DEFAULT_INT_IOR)))
+    own = [name for name in ("eta", "k") if name in given]
+    if "material" not in given and not own:
+        return MediumBelow("int_ior", index_from("int_ior", given.get("int_ior", DEFAULT_INT_IOR)))
     named = own[0] if own else "material"
-    if "int_ior" in props or ("ext_ior" in props and "coat_ior" not in props):
+    if "int_ior" in given or ("ext_ior" in given and "coat_ior" not in given):
         raise RequestError(
             f"{named}: a conductor or a perfect mirror takes no int_ior or ext_ior; give one or the other"
         )
     if own:
-        if "material" in props or own == ["k"]:
+        if "material" in given or own == ["k"]:
             raise RequestError(f"{named}: got {' and '.join(own)}, wanted eta and k, or material, one or the other")
         return MediumBelow("eta", None)
-    material = props["material"]
+    material = given["material"]
     if not isinstance(material, str):
         raise RequestError(f"material: got {material!r}, wanted the name of a conductor, such as 'Al', or 'none'")
     return MediumBelow("material", None if material == "none" else conductor_from(material))
 
 
-def boundary_from(props: mi.Properties, media: Media, coat: Coat | None) -> Boundary:
-    """Return the boundary to the medium below, relative to a coat if there is one; `eta` and `k` are textures."""
+def boundary_from(media: Media, coat: Coat | None, eta_and_k: tuple[mi.Texture, mi.Texture] | None) -> Boundary:
+    """Return the boundary to the medium below, which may be given by textures, relative to a coat if there is one."""
     below, above = media.below, None if coat is None or coat.dispersion is None else coat
     if below.parameter == "int_ior":
         assert below.index is not None
         return Dielectric(below.index, (media.coat or media.above).nominal.real, above)
     outside = media.outside if media.coat is None else media.coat.nominal.real
-    if below.parameter == "eta":
-        return SpectralConductor(props.get_texture("eta"), props.get_texture("k", 0.0), outside, above)
+    if eta_and_k is not None:
+        return SpectralConductor(*eta_and_k, outside, above)
     return PerfectMirror() if below.index is None else Conductor(below.index, outside, above)
 
 

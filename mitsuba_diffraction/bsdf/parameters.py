@@ -2,15 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
 from typing import Any
 
-import drjit as dr
 import mitsuba as mi
-import numpy as np
 
 from ..errors import RequestError, is_number
 from ..handed_over_spectra import handed_over
@@ -35,16 +32,13 @@ from ..settings import (
 from ..surface.gratings import PROFILES
 from .base import Base, base_from
 from .coat import Coat
-from .device_tables import larger
 from .fresnel import Boundary, below_from, boundary_from
 from .indices import index_from
 from .mitsuba_internals import nested_plugin
 from .thin_film import with_film
-from .varying import VaryingNumber, check_texture, numbers_from
+from .varying import Scales, check_texture, numbers_from
 
 _MAX_DEGREES = 1e6
-_MIN_HEIGHT_SCALE = 1e-6  # stands for 0, where κ₁, which bounds K of transmitted light, would vanish
-_MIN_LATERAL_SCALE = 0.01  # below, a period is shorter than any wavelength
 _SCALAR_ONLY = {
     "height_scale": "build the spectrum of the other depth",
     "lateral_scale": "build the spectrum of the other period",
@@ -59,6 +53,11 @@ _SCALAR_ONLY = {
 }
 
 
+def _given(props: mi.Properties, *names: str) -> dict[str, Any]:
+    """Return the parameters of these names that a scene has."""
+    return {name: props[name] for name in names if name in props}
+
+
 def media_from(props: mi.Properties) -> Media:
     """Return the media of a scene, from `ext_ior`, `coat_ior`, `int_ior` or `material`, and `transmission`.
 
@@ -71,93 +70,8 @@ def media_from(props: mi.Properties) -> Media:
             got = repr(props[name]) if isinstance(props[name], str | float | int) else "a BSDF"
             raise RequestError(f"{name}: got {got} with transmission={kind}, wanted a dielectric (int_ior) alone")
     coat = index_from("coat_ior", props["coat_ior"]) if "coat_ior" in props else None
-    return Media(below_from(props), index_from("ext_ior", props.get("ext_ior", "air")), coat, kind)
-
-
-class Scales:
-    """The scales of heights and lengths of a scene; iterates over both.
-
-    Attributes:
-        height: of the heights.
-    """
-
-    def __init__(self, props: mi.Properties) -> None:
-        self.height, self._lateral = (
-            VaryingNumber(name, props.get(name, 1.0)) for name in ("height_scale", "lateral_scale")
-        )
-
-    def __iter__(self) -> Iterator[VaryingNumber]:
-        return iter([self.height, self._lateral])
-
-    @property
-    def lateral(self) -> VaryingNumber | None:
-        """The scale of lengths along the surface; None if it is the number 1 and nothing is derived by it."""
-        of_lengths = self._lateral
-        is_one = not of_lengths.varies and of_lengths.values[0] == 1 and not dr.grad_enabled(of_lengths.value)
-        return None if is_one else of_lengths
-
-    @property
-    def max_scale(self) -> float:
-        """The maximum scale, at least one: the spectrum must begin at a wavelength shorter by this factor."""
-        return max(1.0, *(float(scale.values[-1]) for scale in self))
-
-    def ratio_and_lateral(self, si: mi.SurfaceInteraction3f, active: mi.Bool) -> tuple[mi.Float, mi.Float]:
-        """Return h/s and s at a point, h of the heights and s of lengths along the surface.
-
-        Scaling lengths by s and heights by h is equivalent to scaling heights by h/s, at the wavelength λ/s and with
-        lobes of the width s σ_q.
-        """
-        height = larger(self.height.value_at(si, active), _MIN_HEIGHT_SCALE)
-        if self.lateral is None:
-            return height, mi.Float(1.0)
-        # Not the number itself: Dr.Jit cannot differentiate a branch in a virtual call that takes a member as it is.
-        lateral = larger(self.lateral.value_at(si, active), _MIN_LATERAL_SCALE)
-        return height / lateral, lateral
-
-    @property
-    def laterals(self) -> tuple[float, float]:
-        """Bounds of the lateral scale."""
-        return float(self._lateral.values[0]), float(self._lateral.values[-1])
-
-    def ratios(self) -> tuple[float, float]:
-        """Return bounds of the ratio of height scale to lateral scale."""
-        low, high = np.maximum(self.height.values[[0, -1]], _MIN_HEIGHT_SCALE)
-        min_lateral, max_lateral = self.laterals
-        return float(low / max_lateral), float(high / min_lateral)
-
-    def check(self, wavelengths: tuple[float, float], shortest: float, max_resolved: float | None) -> None:
-        """Check the values against the range of a spectrum.
-
-        Args:
-            wavelengths: shortest and longest of the spectrum, nm.
-            shortest: of the light next to the relief, nm.
-            max_resolved: the maximum lateral scale for which orders do not overlap; None if they overlap.
-
-        Raises:
-            RequestError: with the wavelengths for which to build the spectrum.
-        """
-        # A spectrum may begin at a longer wavelength, as long as the lights of the scene do, too.
-        covered = max(shortest / wavelengths[0], 1.0)
-        for scale in self:
-            if not scale.varies:
-                dr.make_opaque(scale.value)
-            low, high = scale.values[[0, -1]]
-            minimum = 0.0 if scale is self.height else _MIN_LATERAL_SCALE
-            if low < minimum or high > covered * (1 + 1e-6):
-                bad = low if low < minimum else high
-                raise RequestError(
-                    f"{scale.name}: got {bad:.6g}, wanted {minimum:g} to {covered:.4g}: the spectrum was built for "
-                    f"wavelengths from {wavelengths[0]:g} nm; for larger scales build it from {shortest:.4g} nm "
-                    "divided by the scale" + (f", here {shortest / high:.4g} nm" if high > covered else "")
-                )
-        if self.lateral is not None and (max_resolved is None or self.lateral.values[-1] > max_resolved):
-            derivative = " with a derivative" if dr.grad_enabled(self.lateral.value) else ""
-            raise RequestError(
-                f"lateral_scale: got {self.lateral}{derivative}, wanted 1"
-                + ("" if max_resolved is None else f" or less than {max_resolved:.4g}")
-                + ": only of orders that do not overlap the lobes keep their width (not of samples, of tiles as large "
-                "as the coherence length, nor of line gratings with a coherence length below 15 um)"
-            )
+    below = below_from(_given(props, "int_ior", "ext_ior", "coat_ior", "material", "eta", "k"))
+    return Media(below, index_from("ext_ior", props.get("ext_ior", "air")), coat, kind)
 
 
 def spectrum_or_recipe_from(props: mi.Properties, media: Media, scale: float = 1.0) -> Spectrum | Recipe:
@@ -202,7 +116,7 @@ def _theory_of(found: Spectrum | Recipe) -> str:
 
 def _requested(props: mi.Properties) -> dict[str, Any]:
     """Return the parameters of the spectrum that a scene requests; `terms` is a text where it may be "auto"."""
-    given = {name: props[name] for name in REQUESTED if name in props}
+    given = _given(props, *REQUESTED)
     if isinstance(terms := given.get("terms"), str) and terms.isdecimal():
         given["terms"] = int(terms)
     return given
@@ -355,6 +269,19 @@ def check_rigorous(spectrum: RigorousSpectrum, request: GratingRequest) -> None:
         )
 
 
+def _base_from(props: mi.Properties) -> Base | None:
+    """Return the base of the parameter of this name, or None.
+
+    Raises:
+        RequestError: if a nested BSDF has another name.
+    """
+    if any(name != "base" and isinstance(value, mi.BSDF) for name, value in props.objects()):
+        raise RequestError(
+            'base: got a nested BSDF without this name, wanted <bsdf name="base" …> (in load_dict, the key "base")'
+        )
+    return base_from(props["base"]) if "base" in props else None
+
+
 @dataclass(frozen=True)
 class GratingRequest:
     """The parameters of a grating, checked before a spectrum is computed for it.
@@ -419,7 +346,7 @@ class GratingRequest:
         Raises:
             RequestError: if one is wrong, or they contradict each other.
         """
-        media, scales = media_from(props), Scales(props)
+        media, scales = media_from(props), Scales(props.get("height_scale", 1.0), props.get("lateral_scale", 1.0))
         angle = props.get("orientation", 0.0)
         if isinstance(angle, float | int) and not (is_number(angle) and abs(angle) <= _MAX_DEGREES):
             raise RequestError(f"orientation: got {angle}, wanted degrees, up to {_MAX_DEGREES:g}, or a texture")
@@ -432,7 +359,9 @@ class GratingRequest:
             orientation = props.get_texture("orientation", 0.0)
         check_texture("orientation", orientation)
         coat = Coat.of(media)
-        bare = boundary_from(props, media, coat)
+        of_metal = media.below.parameter == "eta"
+        eta_and_k = (props.get_texture("eta"), props.get_texture("k", 0.0)) if of_metal else None
+        bare = boundary_from(media, coat, eta_and_k)
         scale, stated = scales.max_scale, None
         given = spectrum_or_recipe_from(props, media, scale)
         if _theory_of(given) == "rigorous":
@@ -440,7 +369,8 @@ class GratingRequest:
             # With a coat, `ext_ior` is the index above the coat.
             if any(name in props for name in ("material", "int_ior", *(["ext_ior"] if media.coat is None else []))):
                 stated = _medium_settings(props, media)
-        boundary, base = with_film(props, bare), base_from(props)
+        boundary = with_film(bare, _given(props, "thin_film_thickness", "thin_film_ior", "thin_film_scale"))
+        base = _base_from(props)
         if base is not None and not boundary.transparent:
             raise RequestError("base: got a BSDF below a conductor or a perfect mirror, which transmit no light")
         shadowing = props.get("shadowing", SHADOWING[0])

@@ -20,7 +20,7 @@ from .continuum import Continuum
 from .energy_factor import Energy
 from .order_sampler import OrderSampler
 from .orders import ScalarOrders
-from .parameters import Scales
+from .varying import Scales
 
 MAX_NODE_PHASE_STEP = 0.5  # radians at the deepest point, between nodes of the ratio of scales in a table of E
 MAX_RATIOS = 16  # number of these nodes

@@ -8,6 +8,7 @@ loop over a table of their indices, whose length is opaque; one film without the
 from __future__ import annotations
 
 import re
+from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, TypeAlias
@@ -122,25 +123,25 @@ def _crossed(
     return [film_stack.across_film(field, y, u, v) for field, y in zip(fields, (z, z / (n * n)), strict=True)], across
 
 
-def with_film(props: mi.Properties, bare: Boundary) -> Boundary:
+def with_film(bare: Boundary, given: Mapping[str, Any]) -> Boundary:
     """Return the boundary with the films of `thin_film_thickness` and `thin_film_ior`, if there are any.
 
     Raises:
         RequestError: if a parameter is wrong, or the medium below cannot have a film.
     """
-    given = [name for name in ("thin_film_thickness", "thin_film_ior") if name in props]
-    if not given:
-        if "thin_film_scale" in props:
+    of_films = [name for name in ("thin_film_thickness", "thin_film_ior") if name in given]
+    if not of_films:
+        if "thin_film_scale" in given:
             raise RequestError("thin_film_scale: got it alone, wanted thin_film_thickness and thin_film_ior with it")
         return bare
-    if len(given) == 1:
-        raise RequestError(f"{given[0]}: got it alone, wanted thin_film_thickness and thin_film_ior together")
+    if len(of_films) == 1:
+        raise RequestError(f"{of_films[0]}: got it alone, wanted thin_film_thickness and thin_film_ior together")
     if isinstance(bare, PerfectMirror):
         raise RequestError("thin_film_thickness: got a film on material=none, wanted a dielectric or a conductor")
-    iors, thickness = props["thin_film_ior"], props["thin_film_thickness"]
+    iors, thickness = given["thin_film_ior"], given["thin_film_thickness"]
     indices = list_entries("thin_film_ior", iors) if isinstance(iors, str) else [iors]
     media = [index_from("thin_film_ior", number_or_text(ior), absorbing=True) for ior in indices]
-    scale = VaryingNumber("thin_film_scale", props.get("thin_film_scale", 1.0))
+    scale = VaryingNumber("thin_film_scale", given.get("thin_film_scale", 1.0))
     if len(media) > 1 or (isinstance(thickness, str) and _is_list(thickness)):
         thickness = _thicknesses(thickness, len(media))
     return FilmedBoundary(bare, media, VaryingNumber("thin_film_thickness", thickness), scale)

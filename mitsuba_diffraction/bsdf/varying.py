@@ -1,8 +1,9 @@
-"""Numbers that may vary over the surface: numbers, textures, and pictures given by the names of their files."""
+"""Numbers that may vary over the surface: numbers, textures, and files of pictures; the scales of a relief."""
 
 from __future__ import annotations
 
 import os
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
@@ -12,7 +13,11 @@ import numpy as np
 
 from ..errors import RequestError, is_number
 from ..files.picture_file import IN_TEXTURE, check_picture
+from .device_tables import larger
 from .mitsuba_internals import nested_plugin
+
+_MIN_HEIGHT_SCALE = 1e-6  # stands for 0, where κ₁, which bounds K of transmitted light, would vanish
+_MIN_LATERAL_SCALE = 0.01  # below, a period is shorter than any wavelength
 
 
 class VaryingNumber:
@@ -75,6 +80,90 @@ class VaryingNumber:
     def __str__(self) -> str:
         low, high = self.values[[0, -1]]
         return f"{low:.6g} to {high:.6g}" if self.varies else str(self.value)
+
+
+class Scales:
+    """The scales of heights and lengths of a scene; iterates over both.
+
+    Attributes:
+        height: of the heights.
+    """
+
+    def __init__(self, height: Any, lateral: Any) -> None:
+        self.height, self._lateral = VaryingNumber("height_scale", height), VaryingNumber("lateral_scale", lateral)
+
+    def __iter__(self) -> Iterator[VaryingNumber]:
+        return iter([self.height, self._lateral])
+
+    @property
+    def lateral(self) -> VaryingNumber | None:
+        """The scale of lengths along the surface; None if it is the number 1 and nothing is derived by it."""
+        of_lengths = self._lateral
+        is_one = not of_lengths.varies and of_lengths.values[0] == 1 and not dr.grad_enabled(of_lengths.value)
+        return None if is_one else of_lengths
+
+    @property
+    def max_scale(self) -> float:
+        """The maximum scale, at least one: the spectrum must begin at a wavelength shorter by this factor."""
+        return max(1.0, *(float(scale.values[-1]) for scale in self))
+
+    def ratio_and_lateral(self, si: mi.SurfaceInteraction3f, active: mi.Bool) -> tuple[mi.Float, mi.Float]:
+        """Return h/s and s at a point, h of the heights and s of lengths along the surface.
+
+        Scaling lengths by s and heights by h is equivalent to scaling heights by h/s, at the wavelength λ/s and with
+        lobes of the width s σ_q.
+        """
+        height = larger(self.height.value_at(si, active), _MIN_HEIGHT_SCALE)
+        if self.lateral is None:
+            return height, mi.Float(1.0)
+        # Not the number itself: Dr.Jit cannot differentiate a branch in a virtual call that takes a member as it is.
+        lateral = larger(self.lateral.value_at(si, active), _MIN_LATERAL_SCALE)
+        return height / lateral, lateral
+
+    @property
+    def laterals(self) -> tuple[float, float]:
+        """Bounds of the lateral scale."""
+        return float(self._lateral.values[0]), float(self._lateral.values[-1])
+
+    def ratios(self) -> tuple[float, float]:
+        """Return bounds of the ratio of height scale to lateral scale."""
+        low, high = np.maximum(self.height.values[[0, -1]], _MIN_HEIGHT_SCALE)
+        min_lateral, max_lateral = self.laterals
+        return float(low / max_lateral), float(high / min_lateral)
+
+    def check(self, wavelengths: tuple[float, float], shortest: float, max_resolved: float | None) -> None:
+        """Check the values against the range of a spectrum.
+
+        Args:
+            wavelengths: shortest and longest of the spectrum, nm.
+            shortest: of the light next to the relief, nm.
+            max_resolved: the maximum lateral scale for which orders do not overlap; None if they overlap.
+
+        Raises:
+            RequestError: with the wavelengths for which to build the spectrum.
+        """
+        # A spectrum may begin at a longer wavelength, as long as the lights of the scene do, too.
+        covered = max(shortest / wavelengths[0], 1.0)
+        for scale in self:
+            if not scale.varies:
+                dr.make_opaque(scale.value)
+            low, high = scale.values[[0, -1]]
+            minimum = 0.0 if scale is self.height else _MIN_LATERAL_SCALE
+            if low < minimum or high > covered * (1 + 1e-6):
+                bad = low if low < minimum else high
+                raise RequestError(
+                    f"{scale.name}: got {bad:.6g}, wanted {minimum:g} to {covered:.4g}: the spectrum was built for "
+                    f"wavelengths from {wavelengths[0]:g} nm; for larger scales build it from {shortest:.4g} nm "
+                    "divided by the scale" + (f", here {shortest / high:.4g} nm" if high > covered else "")
+                )
+        if self.lateral is not None and (max_resolved is None or self.lateral.values[-1] > max_resolved):
+            derivative = " with a derivative" if dr.grad_enabled(self.lateral.value) else ""
+            raise RequestError(
+                f"lateral_scale: got {self.lateral}{derivative}, wanted 1"
+                + ("" if max_resolved is None else f" or less than {max_resolved:.4g}")
+                + ": only of orders that do not overlap the lobes keep their width (not of samples, of tiles as large "
+                "as the coherence length, nor of line gratings with a coherence length below 15 um)"
+            )
 
 
 def number_or_text(value: Any) -> Any:
