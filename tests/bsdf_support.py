@@ -80,6 +80,23 @@ def use(variant):
     if variant.startswith("llvm") and not dr.has_backend(dr.JitBackend.LLVM):
         pytest.skip("Dr.Jit finds no LLVM")
     mi.set_variant(variant)
+    keep_samplers()
+
+
+@functools.cache
+def keep_samplers():
+    """Make the tables that draw orders once for all tests of a process that need the same ones."""
+    from mitsuba_diffraction.bsdf import shared  # which needs a variant
+
+    kept, make = {}, shared.OrderSampler
+
+    def sampler(spectrum, stack, *media_and_scales):
+        key = mi.variant(), spectrum.digest, stack, repr(media_and_scales)
+        if key not in kept:
+            kept[key] = make(spectrum, stack, *media_and_scales)
+        return kept[key]
+
+    shared.OrderSampler = sampler
 
 
 def uniform(value):

@@ -234,12 +234,12 @@ def loop(wrapper, count, kind="plain"):
 @pytest.mark.slow
 @pytest.mark.parametrize("kind", ["plain", "instanced"])
 @pytest.mark.parametrize("wrapper", sorted(WRAPPERS))
-def test_200_scenes_in_a_loop(wrapper, kind):
-    assert loop(wrapper, 200, kind) == "done 1"
+def test_40_scenes_in_a_loop(wrapper, kind):
+    assert loop(wrapper, 40, kind) == "done 1"
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("wrapper", ["none", "mask", "blendbsdf"])
 def test_scenes_in_reference_cycles_of_a_user_are_freed_between_pictures(wrapper):
-    _, living = loop(wrapper, 100, "cycle").split()
+    _, living = loop(wrapper, 40, "cycle").split()
     assert int(living) <= 2
