@@ -114,7 +114,7 @@ def test_double_precision_is_found_in_a_kernel():
     assert not without_double(kernels(lambda: dr.eval(mi.Float(dr.sqrt(mi.Float64(x))))))
 
 
-@pytest.mark.few(2)
+@pytest.mark.few(1)
 @pytest.mark.parametrize("name", GRATINGS)
 def test_a_bsdf_computes_in_single_precision(name):
     bsdf = mi.load_dict(GRATINGS[name]())

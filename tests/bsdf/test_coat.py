@@ -61,6 +61,7 @@ def test_orders_inside_the_coat_have_the_powers_of_the_closed_form(llvm, theta):
     assert checked >= 3
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("mode", ["Radiance", "Importance"])
 def test_a_coat_of_nearly_the_index_outside_changes_no_matrix(mode):
     """An equal index would be no coat."""
@@ -83,6 +84,7 @@ def test_a_coat_of_nearly_the_index_outside_changes_no_matrix(mode):
     assert np.abs(wanted - wanted.swapaxes(0, 1)).max() > 0.05 * wanted.max()
 
 
+@pytest.mark.few(3)
 @pytest.mark.parametrize("theta", [0, 45, 75, 88])
 @pytest.mark.parametrize("turned", [0, 70])
 def test_the_front_face_follows_fresnel_and_no_light_is_gained(llvm, theta, turned):

@@ -112,6 +112,7 @@ FLAT = {
 }
 
 
+@pytest.mark.few(8)
 @pytest.mark.parametrize(
     ("towards", "orientation"), [(DOWN, 0.0), ((0.3, -0.2, -1.0), 30.0)], ids=["normal", "oblique and turned"]
 )

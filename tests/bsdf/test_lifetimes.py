@@ -120,7 +120,7 @@ def render(scene):
     mi.render(scene, spp=1)
 
 
-@pytest.mark.few(12)
+@pytest.mark.few(6)
 @pytest.mark.parametrize(("mode", "wrapper"), PAIRS)
 def test_a_grating_dies_with_its_scene(llvm, mode, wrapper):
     assert freed(lambda scene: None, nested(mode, wrapper))

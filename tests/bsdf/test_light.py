@@ -158,6 +158,7 @@ def test_a_sensor_of_light_outside_a_table_is_refused(llvm):
         mi.render(mi.load_dict(scene(metal)), sensor=sensor, spp=1)
 
 
+@pytest.mark.slow
 def test_a_picture_in_infrared_leaves_the_scene_as_it_was(llvm):
     # Regression: its light replaced that of the scene, so that scales for which there is no table were accepted.
     loaded = mi.load_dict(scene({"type": "diffraction_grating", "spectrum": spectrum(360, 830), "material": "none"}))

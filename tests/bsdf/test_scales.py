@@ -232,6 +232,7 @@ def test_derivatives_by_texels_are_those_of_differences(llvm, name, step, parame
         np.testing.assert_allclose(found[place], difference(total, 0.0, step), rtol=0.01, atol=5e-3 * scale)
 
 
+@pytest.mark.slow
 def test_recipes_and_profiles_are_built_for_the_scales(llvm):
     parameters = {"type": "diffraction_grating", "profile": "blazed", "period": 1.0, "depth": 0.1}
     parameters["conserve_energy"] = False
@@ -367,6 +368,7 @@ def test_e_of_very_different_heights_is_that_of_each(llvm, parameters):
             assert np.abs(difference).mean() < 0.03
 
 
+@pytest.mark.slow
 @pytest.mark.filterwarnings("ignore:pixels of")
 @pytest.mark.parametrize("scale", ["number", pytest.param("texel", marks=pytest.mark.slow)])
 @pytest.mark.parametrize("surface", ["blazed", pytest.param("xenopeltis_synthetic", marks=pytest.mark.slow)])

@@ -428,6 +428,7 @@ def test_other_variants_have_equal_values(variant, kind):
     np.testing.assert_allclose(found[alike], wanted[alike], rtol=2e-3, atol=1e-4 * wanted[alike].max())
 
 
+@pytest.mark.slow
 def test_water_shortens_wavelengths_outside():
     """At q = m/T orders lie at sin θ = m λ/(n T)."""
     bsdf = mi.load_dict(

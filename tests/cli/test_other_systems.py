@@ -67,6 +67,7 @@ LINES = (
 )
 
 
+@pytest.mark.slow
 @pytest.mark.posix("what it takes away")
 @pytest.mark.parametrize("lines", [LINES[:QUICK], pytest.param(LINES[QUICK:], marks=pytest.mark.slow)])
 def test_every_command_runs_without_posix(lines, tmp_path):

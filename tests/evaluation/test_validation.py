@@ -440,6 +440,7 @@ def test_a_tilt_does_not_count_as_roughness():
     assert level == pytest.approx(np.mean(of_wave), rel=0.1)  # the window broadens the wave
 
 
+@pytest.mark.slow
 def test_a_surface_outside_of_the_range_misses_its_bound(command, tmp_path):
     recipe = tmp_path / "narrow.toml"
     recipe.write_text('[surface]\nprofile = "sinusoidal"\nperiod = 0.8\ndepth = 0.4\n')

@@ -309,6 +309,7 @@ def test_heights_hardly_above_their_noise_are_a_concern(depth, warns):
     assert not warns or any("Noise of 1 nm" in text for text in said)
 
 
+@pytest.mark.slow
 def test_a_good_scan_has_no_concerns():
     assert about(waves()) == ()
     assert about(md.gratings.lamellar(2.5, 0.2), measured=False) == ()
@@ -502,6 +503,7 @@ def test_the_slide_of_a_large_tile_shows_a_dozen_periods():
     assert piece.tile_size == pytest.approx((24.0, 24.0))
 
 
+@pytest.mark.slow
 def test_the_slide_of_one_row_shows_whole_periods():
     """Whose pixels are square, so that the tile is much longer than wide."""
     row = md.HeightField(md.gratings.sinusoidal(PERIOD, DEPTH, samples=64).heights, PERIOD / 64)

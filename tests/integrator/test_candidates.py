@@ -341,6 +341,7 @@ def blend(*bsdfs):
     return {"type": "blendbsdf", "weight": 0.35, **{f"bsdf{k}": bsdf for k, bsdf in enumerate(bsdfs)}}
 
 
+@pytest.mark.few(1)
 @pytest.mark.parametrize("other", ["film", "glass", "plastic"])
 def test_failures_in_a_blend_are_told_by_densities(other, llvm):
     """Where a part transmits light, or is of another class, directions of failed samples may have a value."""

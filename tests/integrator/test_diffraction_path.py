@@ -383,6 +383,7 @@ def test_few_light_paths_have_the_expectation_of_many(llvm, monkeypatch):
     assert (error < 0.02 * many.max()).all()
 
 
+@pytest.mark.few(4)
 @pytest.mark.parametrize(
     ("bsdf", "traces"),
     [

@@ -166,6 +166,7 @@ def with_lamp_and_sky():
     return {**with_sky(), "sky": {"type": "constant", "radiance": uniform(0.02)}, "lamp": lamp, **LAMPS["bulb"]()}
 
 
+@pytest.mark.slow
 def test_instances_have_wavelengths_of_their_own(llvm):
     plate = {"type": "rectangle", "to_world": mi.ScalarTransform4f().translate([3, 0, 0]), "bsdf": blaze()}
     to_world = mi.ScalarTransform4f().translate([-3, 0, 0])
@@ -212,6 +213,7 @@ def test_resampling_keeps_each_wavelength_in_proportion_to_its_value(llvm):
         assert value[kept == wavelength].sum() / 4000 == pytest.approx(wanted, abs=3e-3)
 
 
+@pytest.mark.slow
 def test_without_lamps_the_samples_are_the_same(llvm):
     lamp = with_lamp_and_sky()["lamp"]
     built = scene(blaze(), {"lamp": lamp})

@@ -108,7 +108,7 @@ def test_the_bsdf_sends_light_where_the_design_says(request_, laser, llvm):
     assert max(correlations.values()) < 0.6
 
 
-@pytest.mark.few(2)
+@pytest.mark.few(1)
 @pytest.mark.parametrize("seen_on", ["wall", "screen"])
 @pytest.mark.parametrize("int_ior", [None, 1.5])
 def test_an_f_is_an_f_where_it_is_seen(seen_on, int_ior):
@@ -212,6 +212,7 @@ def test_an_interrupted_design_is_the_best_so_far(laser):
     assert 0.5 < found.efficiency[0] < laser.efficiency[0]
 
 
+@pytest.mark.slow
 @pytest.mark.not_quick
 def test_errors_of_making_are_those_of_another_relief(laser):
     deeper = md.HeightField(1.05 * laser.height_field.heights, laser.height_field.pixel_size)
@@ -226,6 +227,7 @@ def test_errors_of_making_are_those_of_another_relief(laser):
     assert abs(found - laser.efficiency[0]) > 0.005
 
 
+@pytest.mark.slow
 @pytest.mark.not_quick
 def test_white_light_is_directed_at_all_wavelengths():
     found = md.design(lopsided(), texel=1.0, texels=16, starts=3)
@@ -284,6 +286,7 @@ def test_the_recipe_of_a_deep_relief_for_infrared_light_is_accepted(tmp_path):
     assert recipe.settings.largest_height_range > np.ptp(design.height_field.heights) > 20
 
 
+@pytest.mark.few(1)
 @pytest.mark.parametrize("unused", ["outside", "mirror"])
 def test_the_target_has_the_colours_of_the_picture_and_the_prediction_those_of_its_light(unused):
     encoded = np.zeros((24, 24, 3))
@@ -312,6 +315,7 @@ def test_the_target_has_the_colours_of_the_picture_and_the_prediction_those_of_i
     assert design.colour_difference > 5
 
 
+@pytest.mark.slow
 def test_the_search_keeps_hues():
     """Where the light of each wavelength counts alike, red is beige, 1.5 times as bright in red as in blue light."""
     picture = np.full((24, 24, 3), (0.8, 0.1, 0.05))

@@ -137,6 +137,7 @@ def test_a_negative_is_cast_and_dark_on_light_is_named(command, noted):
     assert "note: paper.png is light up to its edges; --invert casts what is dark in it, with more contrast" in error
 
 
+@pytest.mark.slow
 def test_invert_is_not_advised_where_it_is_given(command):
     picture = np.zeros((24, 24), np.uint8)
     picture[8:12, 8:14] = 255
@@ -173,6 +174,7 @@ def test_a_target_of_32_bits_is_refused(kind):
         read_picture(Path("grey.tif"))
 
 
+@pytest.mark.few(1)
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
 def test_an_interrupted_command_writes_the_best_so_far(command, monkeypatch, number):
     class Bar:

@@ -95,6 +95,7 @@ def test_bands_cover_the_film(monkeypatch):
     assert bands_of(SceneFile(write_scene("prb")).load()) == ((0, 10),)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("integrator", "sampler"),
     [("path", "multijitter"), pytest.param("diffraction_path", "independent", marks=pytest.mark.slow)],
@@ -147,6 +148,7 @@ def test_light_of_bands_is_that_of_the_whole_bit_for_bit(three_bands):
         np.testing.assert_array_equal(banded[..., :-1], whole)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("integrator", "light", "hidden"),
     [
@@ -250,6 +252,7 @@ def test_previews_of_bands_hold_one_band_in_memory(three_bands, small_passes, mo
     assert [preview[6:].any() for preview in previews] == 2 * [False] + 3 * [True]
 
 
+@pytest.mark.slow
 def test_the_error_of_bands_is_that_of_the_whole_picture(three_bands, small_passes, monkeypatch):
     small_passes(11)
     banded = render(write_scene(), spp=64, until_error=0.2)
@@ -269,6 +272,7 @@ def test_checkpoints_that_do_not_fit_on_the_disk_are_refused(three_bands, monkey
         render(write_scene(), spp=4, checkpoint="c")
 
 
+@pytest.mark.slow
 def test_what_a_rendering_needs_is_announced_after_two_bands(three_bands, small_passes, monkeypatch):
     small_passes(11)
     clock = itertools.count(0, 10)  # each look at the clock is ten seconds after the one before

@@ -153,6 +153,7 @@ def test_the_grating_is_put_inside_of_what_wraps_a_material(exported, wrapper, v
         assert kept.plugin_name() == "diffuse"
 
 
+@pytest.mark.slow
 def test_a_grating_that_transmits_light_is_on_no_side_of_a_mask(exported):
     """A `twosided` cannot hold it, and the mask remains."""
     path = exported()

@@ -53,6 +53,7 @@ MEENT = [
 ]
 
 
+@pytest.mark.few(10)
 @pytest.mark.parametrize("case", MEENT, ids=lambda case: f"{case.profile}, {case.material}, {case}")
 def test_in_plane_incidence_agrees_with_meent(case):
     found = rigorous.efficiencies(
@@ -395,6 +396,7 @@ def test_an_order_exactly_at_the_horizon_is_the_limit_of_nearby_wavelengths(heig
     np.testing.assert_allclose(at.unpolarised[shared], near.unpolarised, atol=1e-4)
 
 
+@pytest.mark.slow
 def test_the_error_of_scalar_theory_is_found_with_an_order_at_the_horizon():
     """Order 8 of 2.4 µm, at 450 nm and normal incidence, inside n = 1.5."""
     near, at = (scalar_error(gratings.sinusoidal(period, 0.1)) for period in (2.4003, 2.4))

@@ -16,6 +16,7 @@ def of(found, m, eta):
     return eta[:, [where[tuple(pair)] for pair in np.asarray(m).tolist()]]
 
 
+@pytest.mark.few(3)
 @pytest.mark.parametrize("side", [1, -1], ids=["above", "below"])
 @pytest.mark.parametrize("direction", [(0, 0), (20, 0), (20, 90), (40, 45)])
 def test_a_profile_has_the_orders_of_the_coordinate_transformation_method(direction, side):

@@ -249,6 +249,7 @@ def test_corrected_the_shader_agrees_with_the_model_on_a_snake(llvm, snake):
     assert published > 10 * corrected
 
 
+@pytest.mark.slow
 def test_only_pixels_covered_by_gratings_are_compared(llvm, tmp_path):
     plate = PLATE.replace("{}", '<bsdf type="diffuse"/>')
     pictures = Pictures(write(tmp_path / "scene.xml", shapes=SPHERE + plate), "gem", width=64)

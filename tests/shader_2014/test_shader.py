@@ -233,6 +233,7 @@ def test_27000_texels_are_read_for_a_point():
 # --- NMM --------------------------------------------------------------------------------------------------------------
 
 
+@pytest.mark.slow
 def test_nmm_with_its_jacobian_converges_to_flss():
     x = np.linspace(-0.9, 0.8, 60)
     wi, wo = np.broadcast_to(unit(0.2), (60, 3)), unit(x)

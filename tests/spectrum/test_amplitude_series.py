@@ -146,6 +146,7 @@ def test_too_few_terms_raise_one_warning_and_record_their_error():
     assert max_error > 1e-3
 
 
+@pytest.mark.few(1)
 @pytest.mark.parametrize(("depth", "heights_from"), [(1.0, "mean"), (0.6, "lowest"), (20.0, "mean")])
 def test_taylor_refuses_deep_surfaces_with_the_reason(depth, heights_from):
     field = md.gratings.sinusoidal(2.5, depth)
