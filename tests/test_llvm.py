@@ -137,3 +137,17 @@ def test_without_any_llvm_the_message_says_what_is_missing(first: str) -> None:
     assert "needs LLVM 17 or later (none found)" in line
     assert "DRJIT_LIBLLVM_PATH" in line
     assert line in refusal
+
+
+def test_a_library_that_dr_jit_misses_is_named(tmp_path: Path) -> None:
+    """Its own report of it is a NameError of Dr.Jit 1.5."""
+    missing = "libatomic.so.1: cannot open shared object file: No such file or directory"
+    (tmp_path / "mitsuba.py").write_text(
+        f"try:\n    raise ImportError({missing!r})\nexcept ImportError:\n    _drjit_ext\n"
+    )
+    (tmp_path / "scene.xml").write_text('<scene version="3.0.0"/>')
+    command = [sys.executable, "-m", "mitsuba_diffraction", "render", str(tmp_path / "scene.xml")]
+    environment = {**os.environ, "PYTHONPATH": os.pathsep.join([str(tmp_path), *sys.path])}
+    process = subprocess.run(command, env=environment, capture_output=True, text=True)
+    wanted = f"mitsuba-diffraction: error: Dr.Jit cannot be loaded: {missing} (Debian: apt install libatomic1)\n"
+    assert (process.returncode, process.stderr) == (1, wanted)

@@ -65,7 +65,13 @@ class _MitsubaFinder(importlib.abc.MetaPathFinder):
         execute = loader.exec_module
 
         def execute_and_register(module: ModuleType) -> None:
-            execute(module)
+            try:
+                execute(module)
+            except NameError as error:  # Dr.Jit's report of a library that is missing fails with it
+                if not isinstance(missing := error.__context__, ImportError):
+                    raise
+                hint = " (Debian: apt install libatomic1)" if "libatomic" in str(missing) else ""
+                raise ImportError(f"Dr.Jit cannot be loaded: {missing}{hint}") from error
             if self in sys.meta_path:
                 sys.meta_path.remove(self)
             _watch(sys.modules["mitsuba"])
