@@ -39,7 +39,7 @@ from ..spectrum.grids import OrderGrid, spline_weights
 
 _SHORTEST, _LONGEST = 380.0, 740.0  # nm
 _STEP = 4.0  # nm, of the integral in tables; its error is measured
-_STRETCH = 0.15  # a of u = a sinh: below it u is sampled uniformly, above it in proportion to u
+_STRETCH = 0.1  # a of u = a sinh: below it u is sampled uniformly, above it in proportion to u
 _SIZES = ((128, 8), (192, 8), (192, 10))  # nodes along u and along w
 _FINER = 2  # steps of w between two nodes, to which they are fitted
 _MIN_W = 0.15  # without a coat: both directions at 86° from the normal
@@ -290,8 +290,9 @@ def colours_of(viewed: Viewed) -> ColourTable | OrderColours:
 def _table(viewed: Viewed, size: int, layers: int) -> ColourTable:
     """Return a table with its nodes; on a lattice, S at u/λ is a product with a sparse matrix along each axis.
 
-    Along w, values decrease faster than linearly: nodes are fitted to finer steps, as interpolation between values
-    would be too bright in the mean.
+    Interpolation between values of a convex function is too bright in the mean. Along w, nodes are fitted to values in
+    finer steps; along u, a node has its value less a twelfth of the second difference, the fit by least squares where
+    that is constant.
     """
     u = _STRETCH * np.sinh(np.linspace(-1, 1, size) * np.arcsinh(_MAX_U / _STRETCH))
     plane = np.stack(np.meshgrid(u, u), -1)
@@ -306,6 +307,9 @@ def _table(viewed: Viewed, size: int, layers: int) -> ColourTable:
     position = np.arange(len(w)) / _FINER
     hats = np.maximum(1 - np.abs(position[:, None] - np.arange(layers)), 0)
     fitted = np.tensordot(np.linalg.pinv(hats).astype(np.float32), values, 1)
+    for axis in (1, 2):
+        along = np.moveaxis(fitted, axis, 0)  # a view
+        along[1:-1] -= (along[:-2] - 2 * along[1:-1] + along[2:]) / 12
     return ColourTable(to_shared_exponents(fitted), _STRETCH, viewed.range_w)
 
 
