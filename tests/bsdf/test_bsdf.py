@@ -148,7 +148,7 @@ def test_orientation_rotates_the_pattern(llvm):
     np.testing.assert_allclose(value, wanted, rtol=1e-3, atol=1e-4 * wanted.max())
 
 
-@pytest.mark.few(2)
+@pytest.mark.few(1)
 @pytest.mark.parametrize("name", sorted(MAKE))
 def test_values_are_finite_for_any_directions(llvm, name):
     bsdf = plugin(spectrum(name))

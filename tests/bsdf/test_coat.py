@@ -101,6 +101,7 @@ def test_the_front_face_follows_fresnel_and_no_light_is_gained(llvm, theta, turn
     assert front < albedo < 1 + 4 * weight[:, 0].std() / np.sqrt(len(weight))
 
 
+@pytest.mark.slow
 def test_samples_of_resolved_orders_average_to_the_integral_on_a_grid(llvm):
     """Orders beyond the critical angle of the coat, most of the power of these gratings, are not drawn.
 

@@ -302,6 +302,7 @@ def predicted(shape, word):
     return pixels(lobes).mean((1, 3)), pixels(inside).all((1, 3))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("word", ["radial", "tangential"])
 def test_pictures_of_radial_patterns_follow_the_grating_equation(word):
     # Regression: on disks, whose UVs are polar, on spheres and on cylinders the colours lay elsewhere.

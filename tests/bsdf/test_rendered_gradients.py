@@ -141,7 +141,7 @@ def relief():
     return md.precompute(surface, coherence_length=20.0, wavelengths=(160.0, 830.0), tolerance=1e-3)
 
 
-@pytest.mark.few(2)
+@pytest.mark.few(1)
 @pytest.mark.parametrize(("name", "wrapper", "integrator"), list(rows()))
 def test_the_derivative_of_a_rendering_is_that_of_differences(relief, name, wrapper, integrator):
     end, step, given = PARAMETERS[name]

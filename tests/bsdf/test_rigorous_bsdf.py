@@ -118,7 +118,7 @@ def test_samples_have_even_weights_that_average_to_the_efficiencies(llvm, spectr
         assert albedo <= 1 + 1e-3
 
 
-@pytest.mark.few(2)
+@pytest.mark.few(1)
 @pytest.mark.parametrize("theta", [0, 40, 75])
 def test_samples_pass_the_chi_square_test(llvm, solved, theta):
     wide = dataclasses.replace(solved, settings=dataclasses.replace(solved.settings, coherence_length=3.0))
@@ -306,6 +306,7 @@ def test_unpolarised_light_is_that_of_variants_without_polarisation(variant, sol
             assert (np.linalg.norm(out[:, 1:], axis=1) <= (1 + 2 * solved.polarisation_error) * out[:, 0]).all()
 
 
+@pytest.mark.slow
 def test_unpolarised_light_is_at_most_polarised_between_the_nodes_of_a_table(solved):
     use("llvm_ad_spectral_polarized")
     wi, wo = pairs(solved, 0.47, 2000)

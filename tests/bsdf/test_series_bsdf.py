@@ -75,7 +75,7 @@ def test_scaled_heights_have_the_values_of_that_depth(kind):
     np.testing.assert_allclose(got[:, 0], wanted, rtol=3e-3, atol=1e-3 * wanted.max())
 
 
-@pytest.mark.few(2)
+@pytest.mark.slow
 @EACH
 @pytest.mark.parametrize("coherence_length", [65.0, 3.0])
 @pytest.mark.parametrize("mode", ["forward", "backward"])

@@ -58,6 +58,7 @@ def test_options_of_precompute_are_values_of_each_surface(options, values, comma
     assert computed[0].settings != RequestedSurface.of("blazed").recipe.settings
 
 
+@pytest.mark.slow
 def test_options_of_inspect_are_values_of_its_scan(command):
     np.save("grey.npy", np.random.default_rng(3).integers(0, 255, (64, 64), np.uint8))
     numbers = []

@@ -88,6 +88,7 @@ def test_the_command_finds_light_that_is_missing(command, tmp_path, monkeypatch)
     assert "1 of 1 checks missed" in error
 
 
+@pytest.mark.slow
 def test_what_cannot_be_compared_is_refused(command, tmp_path):
     path = tmp_path / "scene.xml"
     path.write_text(SCENE.replace('"path"', '"direct"').replace('<integer name="max_depth" value="3"/>', ""))

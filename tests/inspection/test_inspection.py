@@ -358,6 +358,7 @@ def test_a_name_is_no_formula_of_the_slide(tmp_path):
     save_picture(flat, tmp_path / "flat.png", title=r"$\frac{$")
 
 
+@pytest.mark.slow
 def test_the_picture_is_a_slide(sample, tmp_path):
     path = tmp_path / "slide.png"
     save_picture(sample, path, title="waves")

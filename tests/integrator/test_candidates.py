@@ -248,6 +248,7 @@ def test_candidates_reduce_the_noise_below_a_sky_where_lobes_are_narrow(name, ex
     assert (ratio < 0.5) == expected, ratio
 
 
+@pytest.mark.slow
 def test_each_of_several_gratings_draws_its_own_candidates(llvm):
     """Three plates with a BSDF each and two with the same, of which each stands at the origin once."""
     bsdfs = [surface("elaphe", 26.0), surface(), profile(material="Al", coat_ior=1.5), surface("sinusoidal")]

@@ -299,6 +299,7 @@ def test_light_paths_begin_where_gratings_are_lit(llvm):
     assert dr.all(dr.any(power != 0) | ~starts)
 
 
+@pytest.mark.slow
 def test_each_wavelength_of_a_start_has_a_path_of_its_own(llvm):
     """Each direction of a line grating of narrow lobes has one of the four wavelengths."""
     built = scene(plate=plate(blaze(26.0), 0.5), sun=SUN)
@@ -423,6 +424,7 @@ def image_of_a_wall(bsdf, coherence_length=1.5, x=0, tilt=90):
     return scene(camera, plate=lit, wall=wall, sun=SUN)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("build", "depth", "spp", "ratio"),
     [
@@ -563,7 +565,7 @@ def test_aov_around_it_gives_its_picture(llvm):
     np.testing.assert_allclose(channels[..., :3], own[..., :3], rtol=1e-4)
 
 
-@pytest.mark.few(1)
+@pytest.mark.slow
 @pytest.mark.parametrize("mode", ["forward", "backward"])
 def test_gradients_are_finite_differences(llvm, mode):
     built = sun_alone()

@@ -144,6 +144,7 @@ def test_light_of_lamps_is_the_sum_over_wavelengths(lamps, surface, llvm):
     np.testing.assert_array_less(np.abs(found - wanted), 4 * error + 1e-3 * wanted.max())
 
 
+@pytest.mark.slow
 def test_a_lobe_has_a_small_part_of_the_noise_of_path(llvm):
     """One ray and one direction to the sun: the noise of `path` is that of wavelengths."""
     built = scene(blaze(), LAMPS["sun"]())

@@ -128,6 +128,7 @@ def test_a_hidden_lamp_is_dark_beside_another():
     np.testing.assert_array_less(np.abs(found - wanted), 4 * error + 1e-3 * wanted.max())
 
 
+@pytest.mark.few(1)
 @pytest.mark.parametrize(("weight", "radius"), [(0.0, 0.7), (1.0, 0.1)])
 def test_an_area_lamp_keeps_its_light_beside_lamps_without_extent(weight, radius):
     """Beside a bulb, and a lamp whose direction no sample finds; as often found by candidates, if small, as drawn."""

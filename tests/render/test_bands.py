@@ -225,6 +225,7 @@ def test_bands_are_interrupted_resumed_and_saved(integrator, three_bands, small_
     assert {path.name for path in Path().iterdir()} == {"scene.xml", "a.exr"}
 
 
+@pytest.mark.slow
 def test_previews_of_bands_hold_one_band_in_memory(three_bands, small_passes, monkeypatch):
     small_passes(11)
     monkeypatch.setattr(passes, "MIN_CHECKPOINT_INTERVAL", 0)

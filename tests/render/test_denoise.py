@@ -156,6 +156,7 @@ def test_a_scene_asks_for_a_denoised_preview(command, tmp_path, monkeypatch):
     assert np.abs(pictures["asks.xml"] - pictures["plain.xml"]).max() > 5
 
 
+@pytest.mark.slow
 def test_a_scene_that_asks_for_it_renders_without_the_denoiser(command, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     Path("scene.xml").write_text(ASKS)

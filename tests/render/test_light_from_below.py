@@ -19,6 +19,7 @@ SCENE = """<scene version="3.0.0"><integrator type="path"/>
 <emitter type="area"><rgb name="radiance" value="1"/></emitter></shape></scene>"""
 
 
+@pytest.mark.few(2)
 @pytest.mark.parametrize(
     ("eye", "light", "kind", "message"),
     [
@@ -38,6 +39,7 @@ def test_an_opaque_grating_lit_or_seen_from_below_is_logged(tmp_path, caplog, ey
     assert all(message in logged and "transmission=sheet" in logged for logged in messages)
 
 
+@pytest.mark.slow
 def test_a_denoised_rendering_logs_it_once(tmp_path, monkeypatch, command):
     monkeypatch.chdir(tmp_path)
     Path("s.xml").write_text(SCENE.format(eye=4, light=-5, kind="none"))

@@ -54,7 +54,7 @@ def plain(pictures):
     return pictures(DIFFUSE)
 
 
-@pytest.mark.few(1)
+@pytest.mark.slow
 @pytest.mark.parametrize("kind", BSDFS)
 def test_coloured_pictures_of_numbers_are_those_of_rgb_variants(kind, pictures, plain):
     # Regression: "eval_1_grad(): … raw=false", after all was loaded, without a word of where.

@@ -129,6 +129,7 @@ def test_noise_is_estimated_from_two_halves():
 # --- Quirks -----------------------------------------------------------------------------------------------------------
 
 
+@pytest.mark.few(1)
 @pytest.mark.parametrize(
     "kind", [pytest.param(kind, marks=[pytest.mark.slow] * (kind in ("nmm", "pq"))) for kind in VARIANTS]
 )
@@ -262,7 +263,6 @@ def test_only_pixels_covered_by_gratings_are_compared(llvm, tmp_path):
 
 
 @pytest.mark.slow
-@pytest.mark.few(1)
 @pytest.mark.parametrize("pigment", [True, False])
 def test_brightness_is_fitted_to_the_diffraction_of_this_model(llvm, tmp_path, pigment):
     pictures = Pictures(write(tmp_path / "scene.xml"), "gem", width=8, pigment=pigment)
@@ -286,6 +286,7 @@ def test_brightness_is_fitted_to_the_diffraction_of_this_model(llvm, tmp_path, p
     np.testing.assert_allclose(again.xyz, found.xyz, rtol=1e-4, atol=1e-6 * found.xyz.max())
 
 
+@pytest.mark.slow
 def test_a_crop_window_is_compared_alone(llvm, tmp_path):
     scene = write(tmp_path / "scene.xml")
     whole = Pictures(scene, "gem", brightness=1000)  # not the one found from the pixels

@@ -634,7 +634,7 @@ def test_each_quirk_of_the_scene_is_a_parameter():
         assert np.abs(changed - published).max() > 0.003 * published.max(), name
 
 
-@pytest.mark.few(2)
+@pytest.mark.slow
 @pytest.mark.parametrize(("variant", "unit_of_brightness"), [("flss", 1.0), ("pq", 0.5), ("gem", 1 / 4000)])
 def test_brightness_is_a_factor_of_the_diffraction_before_the_blend(variant, unit_of_brightness):
     """In the published program 1000 is the default, which 0 selects."""
@@ -704,7 +704,7 @@ def luminance(built):
     return xyz(np.array(rgb).T)[:, 1].reshape(16, 8, 16, 8).mean((1, 3))
 
 
-@pytest.mark.few(1)
+@pytest.mark.slow
 @pytest.mark.parametrize("kind", ["normalmap", "bumpmap", "mask", "blendbsdf", "twosided"])
 def test_gratings_are_shaded_inside_other_bsdfs(kind):
     """A wrapper that changes nothing, exactly; and one that does, against this model in the same light."""
