@@ -87,19 +87,15 @@ def define() -> type:
 
         def parts(self, scene: mi.Scene, sensor: mi.Sensor) -> tuple[mi.SamplingIntegrator, LightPaths | None]:
             """Return the tracers of paths from the eye and from the light; None for the light without such paths."""
-            cache = self.cache
-            cache.follow(scene, sensor)
-            gratings = _lit_gratings(scene, sensor, self.max_depth, cache)
+            self.cache.follow(scene, sensor)
+            gratings = _lit_gratings(scene, sensor, self.max_depth, self.cache)
             if gratings is None:
                 return self.path, None
-            eye = eye_class(EyeTracer(scene, sensor, gratings, cache, self.max_depth, self.rr_depth))
+            of_both = scene, sensor, gratings, self.cache, self.max_depth, self.rr_depth
+            eye = eye_class(EyeTracer(*of_both))
             if 0 <= self.max_depth < 3 or not gratings.shapes:
                 return (eye if eye.candidates.any or eye.lamps.any else self.path), None
-            recorded = recorded_wavelengths(sensor.film())
-            others = [shape for shape in scene.shapes() if shape not in gratings]
-            if cache.once("all black", lambda: all(is_black(shape.bsdf(), *recorded) for shape in others)):
-                return eye, None
-            return eye, LightPaths(scene, sensor, gratings, cache, self.max_depth, self.rr_depth)
+            return eye, (None if _is_all_black(scene, sensor, gratings, self.cache) else LightPaths(*of_both))
 
         def sample(
             self,
@@ -180,6 +176,13 @@ def _lit_gratings(scene: mi.Scene, sensor: mi.Sensor, max_depth: int, cache: Sce
             "sample_border: got true, wanted false: points outside the film's edge cannot be connected to it"
         )
     return gratings
+
+
+def _is_all_black(scene: mi.Scene, sensor: mi.Sensor, gratings: Gratings, cache: SceneCache) -> bool:
+    """Return whether no shape but gratings reflects or transmits light that the film records."""
+    recorded = recorded_wavelengths(sensor.film())
+    others = [shape for shape in scene.shapes() if shape not in gratings]
+    return cache.once("all black", lambda: all(is_black(shape.bsdf(), *recorded) for shape in others))
 
 
 def _trace_eye_paths(scene: mi.Scene, sensor: mi.Sensor, eye: Any, seed: mi.UInt32 | int, spp: int) -> int:

@@ -71,6 +71,134 @@ units and show the direct light of a path tracer without a coat and without the 
 """
 
 
+class SceneShader:
+    """The shader of a scene, for a ray.
+
+    Attributes:
+        variant, quirks, settings: of the shader, and its own parameters.
+        shadows: whether shadow rays are cast.
+        diffuse_weight: of a BSDF below a grating, with the quirk `constant_blend`.
+        brightness: of the diffraction.
+        lights: of the scene, by `prepare`: those that are supported.
+        gratings: likewise, their BSDFs.
+        outer: the BSDFs of shapes that are gratings or in which gratings are nested.
+        shaded: what replaces the layers of each grating.
+    """
+
+    def __init__(self, props: mi.Properties) -> None:
+        """Read the parameters of the integrator.
+
+        Raises:
+            RequestError: if one is wrong.
+        """
+        self.variant = props.get("variant", "flss")
+        if self.variant not in VARIANTS:
+            raise RequestError(f"variant: got {self.variant!r}, wanted one of {', '.join(VARIANTS)}")
+        quirks = Quirks.as_published() if _boolean(props, "as_published", True) else Quirks.corrected()
+        self.quirks = replace(quirks, **{name: props[name] for name in Quirks.names() if name in props})
+        self.settings = {name: props[name] for name in parameters_of_variant(self.variant) if name in props}
+        self.shadows = _boolean(props, "shadows", False)
+        self.diffuse_weight = props.get("diffuse_weight", 0.5)
+        if not (isinstance(self.diffuse_weight, int | float) and 0 <= self.diffuse_weight <= 1):
+            raise RequestError(f"diffuse_weight: got {self.diffuse_weight!r}, wanted 0 to 1")
+        self.brightness = checked_brightness(props.get("brightness", PUBLISHED_BRIGHTNESS))
+        self._shaders: list[tuple[Layers, Shader]] = []
+        self.lights: list[Light] = []
+        self.gratings: list[mi.BSDF] = []
+        self.outer: list[mi.BSDF] = []
+        self.shaded: list[Shaded] = []
+
+    def set_quirks(self, quirks: Quirks) -> None:
+        """Set the quirks for the next `prepare`; existing textures are kept."""
+        self.quirks = quirks
+        self._shaders = [(grating, shader.with_quirks(quirks)) for grating, shader in self._shaders]
+
+    def prepare(self, scene: mi.Scene) -> None:
+        """Read the lights and the gratings of a scene.
+
+        Raises:
+            ValueError: if the shader does not support them.
+        """
+        self.lights, (self.gratings, self.outer) = lights_of(scene), gratings_of(scene)
+        base_weight = self.diffuse_weight if self.quirks.constant_blend else None
+        self.shaded = []
+        for layers in (bsdf.layers for bsdf in self.gratings):
+            shader, r_0 = self.shader_of(layers), _normal_reflectance(layers)
+            weights = [shader.weights(r_0, light.irradiance) for light in self.lights]
+            scale = self.brightness * shader.brightness_unit if shader.has_free_scale else 1.0
+            self.shaded.append(Shaded(layers, shader, weights, base_weight, opaque(scale)))
+
+    def shader_of(self, layers: Layers) -> Shader:
+        """Return the shader of a grating; its textures are computed once."""
+        for known, shader in self._shaders:
+            if known is layers:
+                return shader
+        recipe = recipe_of_layers(layers)
+        settings = dict(self.settings, shadowing=layers.grating.theory.shadowing)
+        if self.variant != "gem":
+            settings["corrected_coherence_length"] = float(recipe.settings.coherence_length)
+            boundary = layers.grating.theory.boundary
+            settings["exact_fresnel"] = isinstance(boundary, Dielectric)
+            settings["extent"] = recipe.settings.extent
+            settings["max_height_scale"] = float(layers.grating.scales.height.values[-1])
+        shader = VARIANTS[self.variant](recipe.height_field(), self.quirks, **settings)
+        self._shaders.append((layers, shader))
+        return shader
+
+    def shade(
+        self, scene: mi.Scene, ray: mi.RayDifferential3f, active: mi.Bool = True
+    ) -> tuple[mi.Color3f, mi.UnpolarizedSpectrum, mi.Bool]:
+        """Shade the surface hit by a ray.
+
+        Returns:
+            Linear sRGB of gratings from the shader; radiance of all other BSDFs, per nm at the wavelengths of the
+            ray; and whether a surface was hit.
+        """
+        if not self.lights:
+            self.prepare(scene)
+
+        def at_hit(
+            si: mi.SurfaceInteraction3f, bsdf: mi.BSDFPtr, active: mi.Bool
+        ) -> tuple[mi.Color3f, mi.UnpolarizedSpectrum]:
+            rgb, radiance = mi.Color3f(0), mi.UnpolarizedSpectrum(0)
+            of_grating = mi.Bool(False)
+            for outer in self.outer:
+                of_grating |= bsdf == mi.BSDFPtr(outer)
+            for index, light in enumerate(self.lights):
+                ds, falloff, irradiance = light.sample(si, active)
+                lit = mi.Bool(active)
+                if self.shadows:
+                    lit &= ~scene.ray_test(si.spawn_ray_to(ds.p), active)
+                direction = si.to_local(ds.d)
+
+                def value(
+                    light: int | None,
+                    active: mi.Bool,
+                    at: mi.SurfaceInteraction3f = si,
+                    wo: mi.Vector3f = direction,
+                ) -> mi.UnpolarizedSpectrum:
+                    for shaded in self.shaded:
+                        shaded.light = light
+                    return mi.unpolarized_spectrum(bsdf.eval(mi.BSDFContext(), at, wo, active))
+
+                others, both = value(None, lit), value(index, lit & of_grating)
+                radiance += dr.select(lit, others * irradiance, 0)
+                colour = mi.Color3f(*((both - others)[channel] for channel in range(3)))
+                rgb += dr.select(lit & of_grating, falloff * colour, 0)
+            return rgb, radiance
+
+        with in_place(self.gratings, self.shaded):
+            (rgb, radiance), active = sum_along(scene, ray, active, at_hit)
+        return dr.select(active, rgb, 0), radiance, active
+
+    def __str__(self) -> str:
+        on = [name for name in Quirks.names() if getattr(self.quirks, name)]
+        return (
+            f"DiffractionShader[\n  variant = {self.variant},\n  quirks = {', '.join(on) or 'none'},\n"
+            f"  brightness = {self.brightness:g},\n  shadows = {self.shadows}\n]"
+        )
+
+
 def define() -> type:
     """Define the plugin class for the current variant, as its base class depends on the variant."""
 
@@ -79,63 +207,8 @@ def define() -> type:
 
         def __init__(self, props: mi.Properties) -> None:
             # As in `DiffractionGrating`: anything that may fail precedes the registration of the object by Mitsuba.
-            self.variant = props.get("variant", "flss")
-            if self.variant not in VARIANTS:
-                raise RequestError(f"variant: got {self.variant!r}, wanted one of {', '.join(VARIANTS)}")
-            quirks = Quirks.as_published() if _boolean(props, "as_published", True) else Quirks.corrected()
-            self.quirks = replace(quirks, **{name: props[name] for name in Quirks.names() if name in props})
-            self.settings = {name: props[name] for name in parameters_of_variant(self.variant) if name in props}
-            self.shadows = _boolean(props, "shadows", False)
-            self.diffuse_weight = props.get("diffuse_weight", 0.5)
-            if not (isinstance(self.diffuse_weight, int | float) and 0 <= self.diffuse_weight <= 1):
-                raise RequestError(f"diffuse_weight: got {self.diffuse_weight!r}, wanted 0 to 1")
-            self.brightness = checked_brightness(props.get("brightness", PUBLISHED_BRIGHTNESS))
-            self.emission = Emission()
+            self.scene_shader, self.emission = SceneShader(props), Emission()
             mi.SamplingIntegrator.__init__(self, props)
-            self._shaders: list[tuple[Layers, Shader]] = []
-            # Of the scene, by `prepare`: the lights that are supported; the BSDFs of the gratings; the BSDFs of shapes
-            # that are gratings or in which gratings are nested; and what replaces the layers of each grating.
-            self.lights: list[Light] = []
-            self.gratings: list[mi.BSDF] = []
-            self.outer: list[mi.BSDF] = []
-            self.shaded: list[Shaded] = []
-
-        def set_quirks(self, quirks: Quirks) -> None:
-            """Set the quirks for the next `prepare`; existing textures are kept."""
-            self.quirks = quirks
-            self._shaders = [(grating, shader.with_quirks(quirks)) for grating, shader in self._shaders]
-
-        def prepare(self, scene: mi.Scene) -> None:
-            """Read the lights and the gratings of a scene.
-
-            Raises:
-                ValueError: if the shader does not support them.
-            """
-            self.lights, (self.gratings, self.outer) = lights_of(scene), gratings_of(scene)
-            base_weight = self.diffuse_weight if self.quirks.constant_blend else None
-            self.shaded = []
-            for layers in (bsdf.layers for bsdf in self.gratings):
-                shader, r_0 = self.shader_of(layers), _normal_reflectance(layers)
-                weights = [shader.weights(r_0, light.irradiance) for light in self.lights]
-                scale = self.brightness * shader.brightness_unit if shader.has_free_scale else 1.0
-                self.shaded.append(Shaded(layers, shader, weights, base_weight, opaque(scale)))
-
-        def shader_of(self, layers: Layers) -> Shader:
-            """Return the shader of a grating; its textures are computed once."""
-            for known, shader in self._shaders:
-                if known is layers:
-                    return shader
-            recipe = recipe_of_layers(layers)
-            settings = dict(self.settings, shadowing=layers.grating.theory.shadowing)
-            if self.variant != "gem":
-                settings["corrected_coherence_length"] = float(recipe.settings.coherence_length)
-                boundary = layers.grating.theory.boundary
-                settings["exact_fresnel"] = isinstance(boundary, Dielectric)
-                settings["extent"] = recipe.settings.extent
-                settings["max_height_scale"] = float(layers.grating.scales.height.values[-1])
-            shader = VARIANTS[self.variant](recipe.height_field(), self.quirks, **settings)
-            self._shaders.append((layers, shader))
-            return shader
 
         def sample(
             self,
@@ -147,63 +220,13 @@ def define() -> type:
         ) -> tuple[mi.Spectrum, mi.Bool, list[mi.Float]]:
             # Once per picture, as lights and materials may have changed. (Overriding `render` and calling Mitsuba's
             # would leave its Ctrl-C handler installed.)
-            self.prepare(scene)
-            rgb, radiance, active = self.shade(scene, ray, active)
+            self.scene_shader.prepare(scene)
+            rgb, radiance, active = self.scene_shader.shade(scene, ray, active)
             radiance += self.emission(rgb, ray.wavelengths, active)
             return mi.depolarizer(radiance), active, []
 
-        def shade(
-            self, scene: mi.Scene, ray: mi.RayDifferential3f, active: mi.Bool = True
-        ) -> tuple[mi.Color3f, mi.UnpolarizedSpectrum, mi.Bool]:
-            """Shade the surface hit by a ray.
-
-            Returns:
-                Linear sRGB of gratings from the shader; radiance of all other BSDFs, per nm at the wavelengths of the
-                ray; and whether a surface was hit.
-            """
-            if not self.lights:
-                self.prepare(scene)
-
-            def at_hit(
-                si: mi.SurfaceInteraction3f, bsdf: mi.BSDFPtr, active: mi.Bool
-            ) -> tuple[mi.Color3f, mi.UnpolarizedSpectrum]:
-                rgb, radiance = mi.Color3f(0), mi.UnpolarizedSpectrum(0)
-                of_grating = mi.Bool(False)
-                for outer in self.outer:
-                    of_grating |= bsdf == mi.BSDFPtr(outer)
-                for index, light in enumerate(self.lights):
-                    ds, falloff, irradiance = light.sample(si, active)
-                    lit = mi.Bool(active)
-                    if self.shadows:
-                        lit &= ~scene.ray_test(si.spawn_ray_to(ds.p), active)
-                    direction = si.to_local(ds.d)
-
-                    def value(
-                        light: int | None,
-                        active: mi.Bool,
-                        at: mi.SurfaceInteraction3f = si,
-                        wo: mi.Vector3f = direction,
-                    ) -> mi.UnpolarizedSpectrum:
-                        for shaded in self.shaded:
-                            shaded.light = light
-                        return mi.unpolarized_spectrum(bsdf.eval(mi.BSDFContext(), at, wo, active))
-
-                    others, both = value(None, lit), value(index, lit & of_grating)
-                    radiance += dr.select(lit, others * irradiance, 0)
-                    colour = mi.Color3f(*((both - others)[channel] for channel in range(3)))
-                    rgb += dr.select(lit & of_grating, falloff * colour, 0)
-                return rgb, radiance
-
-            with in_place(self.gratings, self.shaded):
-                (rgb, radiance), active = sum_along(scene, ray, active, at_hit)
-            return dr.select(active, rgb, 0), radiance, active
-
         def to_string(self) -> str:
-            on = [name for name in Quirks.names() if getattr(self.quirks, name)]
-            return (
-                f"DiffractionShader[\n  variant = {self.variant},\n  quirks = {', '.join(on) or 'none'},\n"
-                f"  brightness = {self.brightness:g},\n  shadows = {self.shadows}\n]"
-            )
+            return str(self.scene_shader)
 
     return DiffractionShader
 

@@ -643,8 +643,8 @@ def test_brightness_is_a_factor_of_the_diffraction_before_the_blend(variant, uni
 
     def straight_down(bsdf, **parameters):
         built = scene(shader(variant, **parameters), bsdf)
-        rgb, below, _ = built.integrator().shade(built, ray)
-        return array(rgb).ravel(), array(below).ravel(), built.integrator().shaded[0].weights[0].luminance
+        rgb, below, _ = built.integrator().scene_shader.shade(built, ray)
+        return array(rgb).ravel(), array(below).ravel(), built.integrator().scene_shader.shaded[0].weights[0].luminance
 
     found, _, light = straight_down(GRATING)
     alone = colour(BLAZE, unit(0.0), unit([0.0]), variant=variant)[0] * light
@@ -700,7 +700,7 @@ def luminance(built):
     jitter = np.random.default_rng(1).random((2, 256 * 64))
     y, x = (np.mgrid[: 16 * 8, : 16 * 8].reshape(2, -1) + jitter) / (16 * 8)
     ray, _ = built.sensors()[0].sample_ray(0, 0.5, mi.Point2f(x.astype(np.float32), y.astype(np.float32)), 0.5)
-    rgb, _, _ = built.integrator().shade(built, mi.RayDifferential3f(ray))
+    rgb, _, _ = built.integrator().scene_shader.shade(built, mi.RayDifferential3f(ray))
     return xyz(np.array(rgb).T)[:, 1].reshape(16, 8, 16, 8).mean((1, 3))
 
 

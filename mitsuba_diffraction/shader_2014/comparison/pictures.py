@@ -37,7 +37,7 @@ from ...render.trace_pass import (
 )
 from ...settings import VISIBLE
 from .. import tristimulus
-from ..diffraction_shader import PUBLISHED_BRIGHTNESS, checked_brightness, parameters_of_variant
+from ..diffraction_shader import PUBLISHED_BRIGHTNESS, SceneShader, checked_brightness, parameters_of_variant
 from ..flss import FLSS
 from ..lights import lights_of
 from ..quirks import Quirks
@@ -102,7 +102,7 @@ def same_light(scene: mi.Scene) -> mi.SamplingIntegrator:
     return _integrator(radiance)
 
 
-def without_gratings(shader: mi.SamplingIntegrator) -> mi.SamplingIntegrator:
+def without_gratings(shader: SceneShader) -> mi.SamplingIntegrator:
     """Return an integrator of a `diffraction_shader` without gratings: only other BSDFs, and BSDFs below gratings."""
 
     def radiance(scene: mi.Scene, ray: mi.RayDifferential3f, active: mi.Bool) -> tuple[mi.Spectrum, mi.Bool]:
@@ -223,7 +223,7 @@ class Pictures:
         own = {name: value for name, value in self._settings.items() if name in parameters_of_variant(shader)}
         brightness = self._brightness or PUBLISHED_BRIGHTNESS
         request = {"type": "diffraction_shader", "variant": shader, "brightness": brightness, **own}
-        self._shader = mi.load_dict(request)
+        self._shader: SceneShader = mi.load_dict(request).scene_shader
         # Refuses a scene that the shader cannot show.
         self._shader.prepare(self.scene)
         self.shaders: list[Shader] = [shaded.shader for shaded in self._shader.shaded]

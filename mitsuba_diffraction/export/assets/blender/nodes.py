@@ -309,16 +309,8 @@ class _Grating(_Nodes):
             along = self.sum(self.difference(to_light, to_camera), self.scaled(x, 1e-4))
         else:
             along = self.difference(x, self.scaled(half, self.dot(half, x)))
-        # Blender's anisotropy a makes slopes of ratio (1 - a)², narrower along the tangent for a > 0.
-        ratio = self.divide(self.smaller(alpha_x, alpha_y), self.larger(alpha_x, alpha_y))
-        sign = self.math("SIGN", self.subtract(alpha_y, alpha_x))
-        lobe = self.node("ShaderNodeBsdfAnisotropic", distribution="BECKMANN")
-        self.put(lobe.inputs["Color"], self.scaled(self.vector("MULTIPLY", colour, inputs["Tint"]), weight))
-        self.put(lobe.inputs["Roughness"], self.math("POWER", self.multiply(alpha_x, alpha_y), 0.25))
-        self.put(lobe.inputs["Anisotropy"], self.multiply(self.subtract(1.0, self.math("SQRT", ratio)), sign))
-        self.put(lobe.inputs["Normal"], half)
-        self.put(lobe.inputs["Tangent"], self.normalised(along))
-        shaded = lobe.outputs[0]
+        colour = self.scaled(self.vector("MULTIPLY", colour, inputs["Tint"]), weight)
+        shaded = self.lobe(colour, alpha_x, alpha_y, half, self.normalised(along))
         if self.dielectric:
             into_base = self.subtract(1.0, self.number(reflectances, of_light, self.texel(c_o, _COSINES)))
             diffuse = self.node("ShaderNodeBsdfDiffuse")
@@ -331,6 +323,19 @@ class _Grating(_Nodes):
             front.inputs["Roughness"].default_value = 0.0
             shaded = self.both(shaded, front)
         self.put(self.node("NodeGroupOutput").inputs["BSDF"], shaded)
+
+    def lobe(self, colour: Any, alpha_x: Any, alpha_y: Any, normal: Any, tangent: Any) -> Any:
+        """Return the shader of a lobe of these widths along the tangent and across."""
+        # Blender's anisotropy a makes slopes of ratio (1 - a)², narrower along the tangent for a > 0.
+        ratio = self.divide(self.smaller(alpha_x, alpha_y), self.larger(alpha_x, alpha_y))
+        sign = self.math("SIGN", self.subtract(alpha_y, alpha_x))
+        node = self.node("ShaderNodeBsdfAnisotropic", distribution="BECKMANN")
+        self.put(node.inputs["Color"], colour)
+        self.put(node.inputs["Roughness"], self.math("POWER", self.multiply(alpha_x, alpha_y), 0.25))
+        self.put(node.inputs["Anisotropy"], self.multiply(self.subtract(1.0, self.math("SQRT", ratio)), sign))
+        self.put(node.inputs["Normal"], normal)
+        self.put(node.inputs["Tangent"], tangent)
+        return node.outputs[0]
 
     def inside(self, cosine: Any) -> Any:
         """Return the cosine in the coat of a direction of this cosine outside."""
