@@ -174,6 +174,17 @@ def test_a_word_of_names_has_one_meaning():
 
 
 @pytest.mark.quick
+def test_no_function_has_more_than_80_lines():
+    """Without its docstring; a screen has 60."""
+    for path in MODULES.values():
+        for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
+            if isinstance(node, ast.FunctionDef):
+                first = node.body[0] if ast.get_docstring(node) else None
+                of_docstring = first.end_lineno - first.lineno + 1 if first else 0
+                assert node.end_lineno - node.lineno + 1 - of_docstring <= 80, f"{path.name}: {node.name}"
+
+
+@pytest.mark.quick
 def test_properties_of_mitsuba_stop_at_the_door():
     """`GratingRequest` has what a scene says of a grating; plugins have theirs, and `render` those of parsed scenes."""
     plugins = {"bsdf.diffraction_grating", "integrator.diffraction_path", "shader_2014.diffraction_shader"}
