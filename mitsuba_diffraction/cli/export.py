@@ -115,8 +115,11 @@ def _write_extension(output: Path, overwrite: bool) -> None:
 def _refuse_parameters_of_scenes(requested: RequestedSurface, surface: str, output: Path) -> None:
     """Refuse parameters of the plugin that files for other programs do not hold, and name what does."""
     is_shader, has_colours = output.suffix.lower() in _SHADERS, output.suffix.lower() == _COLOURS
+    held = _OF_COLOURS if has_colours else ()
+    if output.suffix.lower() == ".npz" and requested.aside.get("transmission") == "sheet":
+        held = ("transmission",)
     for key in _IN_SCENES:
-        if key in requested.aside and not (has_colours and key in _OF_COLOURS):
+        if key in requested.aside and key not in held:
             instead = f"set the input {_INPUTS[key]} of the shader" if is_shader and key in _INPUTS else ""
             if key == "transmission" and output.suffix.lower() == ".csv":
                 command = shell_command("mitsuba-diffraction", "efficiency", surface, "--csv", operand(str(output)))
@@ -141,9 +144,11 @@ def _write_shader(requested: RequestedSurface, output: Path) -> None:
     saved = requested.is_spectrum
     spectrum = requested.spectrum() if saved else shader_recipe(requested.recipe).cached(progress)
     assert isinstance(spectrum, GratingSpectrum)
-    if requested.is_film or requested.media.transmits:
+    media = requested.media
+    sheet = media.transmission == "sheet" or (requested.is_film and media.below.transparent)
+    tables = ShaderTables.of_spectrum(spectrum, media.below, sheet)
+    if (media.transmits or sheet) and not (tables.sheet and output.suffix.lower() == ".npz"):
         say("note", f"{title}: the shader shows the light that it reflects; `render` shows what it transmits")
-    tables = ShaderTables.of_spectrum(spectrum, requested.below)
     _SHADERS[output.suffix.lower()](tables, output)
     if spectrum.warning:
         tell(f"! {spectrum.warning}")

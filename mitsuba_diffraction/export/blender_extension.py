@@ -30,6 +30,7 @@ _SURFACES = {
     "foil": _OF_METALS,
     "xenopeltis": "",
     "elaphe": "",
+    "film": "",
 }
 _METALS = ("Al", "Ag", "Au", "Cu")
 
@@ -56,8 +57,10 @@ def write_extension(path: str | os.PathLike[str], progress: Progress = silent) -
                 requested = RequestedSurface.of(",".join(filter(None, [name, aside])), aside=("material",))
                 spectrum = shader_recipe(requested.recipe).cached()
                 assert isinstance(spectrum, GratingSpectrum)
-                tables = ShaderTables.of_spectrum(spectrum, requested.below)
+                tables = ShaderTables.of_spectrum(spectrum, requested.below, requested.is_film)
                 for write, suffix in ((write_node_tables, ".npz"), (write_shader, ".osl")):
+                    if tables.sheet and suffix == ".osl":  # which does not show what it transmits
+                        continue
                     file = Path(folder, name + suffix)
                     write(tables, file)
                     archive.write(file, f"tables/{file.name}")

@@ -58,6 +58,7 @@ class ShaderTables:
         rows: edges of the rows of cells of equal mean power, (r + 1,); of orders, none.
         columns: edges of the columns in each row, (r, c + 1); of orders, none.
         albedo: what a perfect mirror would reflect, by wavelength, azimuth of ω_o and cos θ_o; of orders, none.
+        sheet: whether the orders are those of a film that transmits light, with a flat lower face.
 
     Raises:
         ValueError: if it has both orders and cells, or shapes differ.
@@ -74,6 +75,7 @@ class ShaderTables:
     rows: Real | None = None
     columns: Real | None = None
     albedo: Real | None = None
+    sheet: bool = False
 
     def __post_init__(self) -> None:
         bins = len(self.edges) - 1
@@ -90,8 +92,10 @@ class ShaderTables:
             raise RequestError(f"powers: got the shape {self.powers.shape}, wanted {sizes[0]} rows")
 
     @classmethod
-    def of_spectrum(cls, spectrum: GratingSpectrum, below: MediumBelow) -> ShaderTables:
-        """Return the tables of a spectrum of scalar theory and of the medium below it, in air.
+    def of_spectrum(cls, spectrum: GratingSpectrum, below: MediumBelow, sheet: bool = False) -> ShaderTables:
+        """Return the tables of a spectrum of scalar theory and of the medium below it, in air, or of a sheet of it.
+
+        Of a continuum, they show reflected light alone.
 
         Raises:
             ValueError: if the material is wrong.
@@ -106,7 +110,7 @@ class ShaderTables:
         common = (what, edges, colours, index, max_kappa, spectrum.lobe_width)
         if isinstance(spectrum.grid, OrderGrid) and kept.sum() <= _MAX_ORDERS:
             powers = _sliced(spectrum, max_kappa, lambda values: values[kept], _MAX_SLICE_ERROR)
-            return cls(*common, powers, frequencies=q[kept])
+            return cls(*common, powers, frequencies=q[kept], sheet=sheet)
         rows, columns, of_cells = _cells(spectrum, max_kappa)
         powers = _sliced(spectrum, max_kappa, of_cells, 10 * _MAX_SLICE_ERROR)
         albedo = _albedo(rows, columns, powers, max_kappa, edges)

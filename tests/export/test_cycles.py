@@ -94,6 +94,8 @@ def test_a_continuum_holds_all_of_its_power_in_cells(tmp_path):
             "got sheet, which s.csv does not hold; it holds orders in reflection; "
             "mitsuba-diffraction efficiency blazed,transmission=sheet --csv s.csv has those in transmission",
         ),
+        ("export blazed,material=Al,transmission=sheet -o s.npz", "got 'sheet' with Al, wanted a transparent medium"),
+        ("export blazed,int_ior=1.5,transmission=sheet -o s.osl", "got sheet, which s.osl does not hold"),
         ("export blazed -o s.osl --angle 0,30", "--angle: s.osl holds all directions and colours, wanted it without"),
         ("export blazed,material=Unobtainium -o s.osl", "Unobtainium"),
         ("export gone.exr -o s.osl", "gone.exr"),
@@ -155,10 +157,11 @@ def path_traced(bsdf, shape, light, spp):
     to = mi.ScalarTransform4f()
     lights = {"sky": {"type": "constant", "radiance": {"type": "d65"}}}
     if light != "sky":
+        above, below = to.translate([0, -1, 3]).rotate([1, 0, 0], 180), to.translate([0, -1, -3])
         lights = {
             "lamp": {
                 "type": "disk",
-                "to_world": to.translate([0, -1, 3]).rotate([1, 0, 0], 180).scale(light),
+                "to_world": (below if "pane" in shape else above).scale(light),
                 "emitter": {"type": "area", "radiance": {"type": "d65", "scale": 100.0}},
             }
         }
@@ -173,7 +176,11 @@ def path_traced(bsdf, shape, light, spp):
                 "to_world": to.look_at([0, 0, 4], [0, 0, 0], [0, 1, 0]),
                 "film": film,
             },
-            "shape": {"type": "sphere" if shape == "sphere" else "rectangle", "bsdf": bsdf},
+            "shape": {
+                "type": "sphere" if shape == "sphere" else "rectangle",
+                "to_world": to.rotate([0, 1, 0], 180 if shape == "pane_from_behind" else 0),
+                "bsdf": bsdf,
+            },
             **lights,
         }
     )
@@ -194,13 +201,15 @@ class Beside:
     coat: float = 1.0
 
     def __str__(self):
-        return f"{self.surface.partition(',')[0]}{'-coated' * (self.coat > 1)}{self.suffix}"
+        behind = "-from-behind" * (self.shape == "pane_from_behind")
+        return f"{self.surface.partition(',')[0]}{'-coated' * (self.coat > 1)}{behind}{self.suffix}"
 
 
 SINUSOID = "sinusoidal,period=1.6,depth=0.15,coherence_length=30,material=Al"
 BLAZE = "blazed,period=1.9,depth=0.2,coherence_length=30,material=Al"
 DISC = "compact_disc,coherence_length=30,material=Al"
 FOIL = "foil,coherence_length=12,material=Al"
+BLAZED_SHEET = "transmission_300,int_ior=1.52,transmission=sheet"
 # Nodes have no negative light, and so no colours outside of sRGB, which orders of both line gratings have: 3.9 and 7.6
 # from the nearest. In the other regions non-negative colours fitted to them alone still leave a ΔE00 of up to 4.4, and
 # those of the nodes are the same for all surfaces. Faint regions of foil and skin are a tenth darker by OSL as well.
@@ -214,6 +223,9 @@ BESIDE = (
     Beside(".npz", "disc", DISC, 1500, 1, (0.95, 1.05), 3, coat=1.55),
     Beside(".npz", "sphere", FOIL, 3000, 2, (0.87, 1.07), 5.5),
     Beside(".npz", "sphere", "xenopeltis_synthetic", 3000, 2, (0.84, 1.07), 7.5),
+    Beside(".npz", "pane", "film,int_ior=1.5,transmission=sheet", 2000, 5, (0.9, 1.1), 9),
+    Beside(".npz", "pane", BLAZED_SHEET, 400, 1, (0.95, 1.05), 6),
+    Beside(".npz", "pane_from_behind", BLAZED_SHEET, 400, 1, (0.95, 1.05), 6),
 )
 
 
@@ -228,7 +240,8 @@ def test_orders_in_cycles_are_those_of_the_path_tracer(case, command, tmp_path, 
         np.savez(shader, **np.load(shader), coat=case.coat)
     name, *values = case.surface.split(",")
     parameters = dict(value.split("=") for value in values)
-    bsdf = {key: value if key == "material" else float(value) for key, value in parameters.items()}
+    names = ("material", "transmission")
+    bsdf = {key: value if key in names else float(value) for key, value in parameters.items()}
     bsdf |= {"type": "diffraction_grating", "profile": name}
     if case.coat > 1:
         bsdf["coat_ior"] = case.coat

@@ -22,6 +22,7 @@ def test_the_tables_of_a_grating_are_its_closed_form(command, tmp_path):
     with np.load(path, allow_pickle=False) as read:
         tables = dict(read)
     assert f"{len(tables['frequencies'])} orders" in said
+    assert not tables["sheet"]
     order = np.round(tables["frequencies"][:, 0] * PERIOD)
     kappa = np.linspace(0, tables["max_kappa"], tables["powers"].shape[1])
     np.testing.assert_allclose(tables["powers"], jv(order[:, None], kappa * DEPTH / 2) ** 2, atol=2e-3)

@@ -2,11 +2,13 @@
 
 Run it by a Python that has bpy (`pip install bpy==4.5.15`, Python 3.11), and NumPy, which comes with it:
 
-    python tools/manual/cycles_picture.py FILE plane|sphere|disc RADIUS|sky SAMPLES SIZE OUT.npy [WORKING_SPACE]
+    python tools/manual/cycles_picture.py FILE SHAPE RADIUS|sky SAMPLES SIZE OUT.npy [SPACE]
 
-FILE is a shader (.osl), or the tables of the node group (.npz). In another working space of Blender 5.0 or later, such
-as "Linear Rec.2020", OUT is RGB of that. The wheel has no `oslquery`, by which Blender's window finds the sockets of a
-shader; they are added by hand here. The scene is that of `scene` in tests/export/test_cycles.py.
+FILE is a shader (.osl), or the tables of the node group (.npz); SHAPE is plane, sphere, disc, or a pane or
+pane_from_behind, with the lamp behind it. In another working SPACE of Blender 5.0 or later, such
+as "Linear Rec.2020", OUT is RGB of that. The wheel has no `oslquery`, by which Blender's
+window finds the sockets of a shader; they are added by hand here. The scene is that of `path_traced` in
+tests/export/test_cycles.py.
 """
 
 import contextlib
@@ -70,7 +72,7 @@ def emission(strength):
 
 
 def build(shader, shape, light, samples, size, space=None):
-    """A square, a sphere or a disc with grooves around it, below a lamp of radiance 100 or under a sky of 1."""
+    """A square, a sphere, a disc with grooves around it or a pane, below a lamp of radiance 100 or under a sky of 1."""
     bpy.ops.wm.read_factory_settings(use_empty=True)
     if space:
         bpy.ops.wm.set_working_color_space(working_space=space)
@@ -92,7 +94,7 @@ def build(shader, shape, light, samples, size, space=None):
         tangent.direction_type, tangent.axis = "RADIAL", "Z"
         material.node_tree.links.new(tangent.outputs[0], script.inputs["Tangent"])
     else:
-        bpy.ops.mesh.primitive_plane_add(size=2)
+        bpy.ops.mesh.primitive_plane_add(size=2, rotation=(0, math.pi if shape == "pane_from_behind" else 0, 0))
         script.inputs["Radial"].default_value = type(script.inputs["Radial"].default_value)(shape == "disc")
     bpy.context.object.data.materials.append(material)
     world = scene.world = bpy.data.worlds.new("world")
@@ -100,8 +102,9 @@ def build(shader, shape, light, samples, size, space=None):
     grey = 1.0 if light == "sky" else 0.0
     world.node_tree.nodes["Background"].inputs[0].default_value = (grey, grey, grey, 1)
     if light != "sky":
+        where, turned = ((0, -1, -3), (0, 0, 0)) if "pane" in shape else ((0, -1, 3), (math.pi, 0, 0))
         bpy.ops.mesh.primitive_circle_add(
-            vertices=64, radius=float(light), fill_type="NGON", location=(0, -1, 3), rotation=(math.pi, 0, 0)
+            vertices=64, radius=float(light), fill_type="NGON", location=where, rotation=turned
         )
         bpy.context.object.data.materials.append(emission(100))
     bpy.ops.object.camera_add(location=(0, 0, 4))

@@ -30,6 +30,7 @@ SCENES = {
     "disc": ("disc", {"profile": "compact_disc", "coherence_length": 30.0, **METAL}),
     "foil": ("sphere", {"profile": "foil", "coherence_length": 12.0, **METAL}),
     "skin": ("sphere", {"profile": "xenopeltis_synthetic"}),
+    "film": ("pane", {"profile": "film", "int_ior": 1.5, "transmission": "sheet"}),
 }
 
 
@@ -44,7 +45,8 @@ def path_traced(shape, parameters):
         film[f"band_{number:03d}"] = {"type": "spectrum", "value": [(w - 10, 0.0), (w, 0.1), (w + 10, 0.0)]}
     around = {"orientation": "radial"} if shape == "disc" else {}
     lamp = {"type": "area", "radiance": {"type": "d65", "scale": 100.0}}
-    place = to.translate([0, -1, 3]).rotate([1, 0, 0], 180).scale(RADIUS)
+    above, below = to.translate([0, -1, 3]).rotate([1, 0, 0], 180), to.translate([0, -1, -3])
+    place = (below if shape == "pane" else above).scale(RADIUS)
     camera = to.look_at([0, 0, 4], [0, 0, 0], [0, 1, 0])
     scene = mi.load_dict(
         {

@@ -1,4 +1,4 @@
-"""Blender's extension "Diffraction Gratings": materials of discs, foil, skins and line gratings."""
+"""Blender's extension "Diffraction Gratings": materials of discs, foil, film, skins and line gratings."""
 
 from __future__ import annotations
 
@@ -17,7 +17,9 @@ _READY = {
     "foil": "Embossed foil",
     "xenopeltis": "Skin of Xenopeltis",
     "elaphe": "Skin of Elaphe",
+    "film": "Diffraction film",
 }
+_NODES_ALONE = ("film",)
 _STAR = "star"
 _FURTHER = {_STAR: "Holographic star", **line_gratings.PROFILES}
 _FILE = "file"
@@ -62,7 +64,12 @@ class DiffractionSettings(bpy.types.PropertyGroup):
         """The file of the OSL shader, if there is one and it is wanted."""
         if self.surface == _FILE:
             return bpy.path.abspath(self.file) if self.file.endswith(".osl") else None
-        return os.path.join(_TABLES, f"{self.surface}.osl") if self.exact and self.surface in _READY else None
+        return os.path.join(_TABLES, f"{self.surface}.osl") if self.exact and self.has_script else None
+
+    @property
+    def has_script(self) -> bool:
+        """Whether the extension holds an OSL shader of the surface."""
+        return self.surface in _READY and self.surface not in _NODES_ALONE
 
     def tables(self) -> dict[str, np.ndarray]:
         """Return the tables of the surface.
@@ -151,7 +158,7 @@ class MATERIAL_PT_diffraction(bpy.types.Panel):
             layout.prop(settings, "depth")
             if settings.surface == "lamellar":
                 layout.prop(settings, "duty")
-        elif settings.surface in _READY:
+        elif settings.has_script:
             layout.prop(settings, "exact")
         if settings.script is None:
             layout.prop(settings, "medium")

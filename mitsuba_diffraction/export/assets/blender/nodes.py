@@ -1,9 +1,9 @@
 """A node group of Blender's own shader nodes that diffracts light, for every device of Cycles.
 
 Each sample draws a wavelength and an order by White Noise of its position, and returns one Glossy lobe about the half
-vector of the direction from which light of that order comes. Needs bpy and NumPy alone; lengths are in µm, frequencies
-in cycles/µm. `tables` are the arrays of `mitsuba-diffraction export SURFACE -o NAME.npz`, and may have `coat`, the
-index of a clear layer over the relief.
+vector of the direction from which light of that order comes; a sheet adds one of transmitted light. Needs bpy and NumPy
+alone; lengths are in µm, frequencies in cycles/µm. `tables` are the arrays of `mitsuba-diffraction export SURFACE -o
+NAME.npz`, and may have `coat`, the index of a clear layer over the relief.
 """
 
 from __future__ import annotations
@@ -18,6 +18,7 @@ _FORMAT = 1  # of the tables
 _SLOTS = 4096  # of orders, each with as many as is its probability
 _COSINES = 64  # of the reflectance
 _AZIMUTHS, _ALBEDO_COSINES = 25, 16
+_REFRACTION = 4.0  # an index that deflects light up to 75°
 _SECTORS, _RINGS, _STAR_TURN = 12, 6.0, 5.0  # of a star; turns of the pattern for one around the axis
 
 INPUTS: tuple[tuple[str, str, Any, tuple[float, float] | None, str], ...] = (
@@ -100,6 +101,8 @@ def node_group(name: str, tables: Mapping[str, np.ndarray]) -> bpy.types.NodeTre
         ValueError: if they have no powers for the shortest wavelength inside the coat, or for the working space.
     """
     coat, max_scale = float(tables.get("coat", 1.0)), float(tables["max_height_scale"])
+    if coat > 1 and tables.get("sheet"):
+        raise ValueError(f"got a coat of index {coat:.3g}; a sheet that transmits light has none")
     if coat > max_scale * (1 + 1e-6):
         raise ValueError(f"got a coat of index {coat:.3g}; these tables are for one of up to {max(max_scale, 1):.3g}")
     tree = bpy.data.node_groups.new(name, "ShaderNodeTree")
@@ -232,6 +235,7 @@ class _Grating(_Nodes):
         self.orders = "frequencies" in tables
         self.coat = float(tables.get("coat", 1.0))
         self.dielectric = bool((tables["index"].imag == 0).all() and (tables["index"].real > 0).all())
+        self.sheet = self.dielectric and bool(tables.get("sheet", False))
 
     def image(self, what: str, values: np.ndarray) -> bpy.types.Image:
         """Return a packed float image of (rows, columns) numbers, or of 4 channels."""
@@ -252,7 +256,10 @@ class _Grating(_Nodes):
         inputs = self.node("NodeGroupInput").outputs
         geometry = self.node("ShaderNodeNewGeometry").outputs
         position, normal, to_camera = geometry["Position"], geometry["Normal"], geometry["Incoming"]
-        x, y = self.tangents(inputs, normal)
+        behind, outside = geometry["Backfacing"], normal
+        if self.sheet:  # seen from behind, Blender's normal is the other one
+            outside = self.scaled(normal, self.math("MULTIPLY_ADD", behind, -2.0, 1.0))
+        x, y = self.tangents(inputs, outside)
         of_light, of_order, _ = self.random(position, 0.5)
 
         # The wavelength, its colour, and the direction from which light of the order comes.
@@ -277,12 +284,16 @@ class _Grating(_Nodes):
         coat = self.coat
         true_c_i, true_c_o, c_i, c_o = c_i, c_o, self.inside(c_i), self.inside(c_o)
         w = self.multiply(self.add(c_i, c_o), coat)
-        slices = tables["powers"].shape[1]
-        kappa = self.multiply(self.divide(inputs["HeightScale"], wavelength), w, 2 * np.pi / float(tables["max_kappa"]))
-        power = self.number(
-            self.image("powers", tables["powers"].T), u_power, self.texel(self.smaller(kappa, 1.0), slices)
-        )
-        square_v = self.add(self.add(self.multiply(step_x, step_x), self.multiply(step_y, step_y)), self.multiply(w, w))
+        powers, slices = self.image("powers", tables["powers"].T), tables["powers"].shape[1]
+        of_heights = self.divide(inputs["HeightScale"], wavelength)
+
+        def power_at(w: Any, powers: bpy.types.Image) -> Any:
+            kappa = self.multiply(of_heights, w, 2 * np.pi / float(tables["max_kappa"]))
+            return self.number(powers, u_power, self.texel(self.smaller(kappa, 1.0), slices))
+
+        power = power_at(w, powers)
+        square_step = self.add(self.multiply(step_x, step_x), self.multiply(step_y, step_y))
+        square_v = self.add(square_step, self.multiply(w, w))
         k = self.divide(self.multiply(square_v, square_v), self.multiply(4.0 * coat**2, c_i, c_o, w, w))
         g = self.smaller(self.divide(self.multiply(4.0 * coat, w, self.smaller(c_i, c_o)), square_v), 1.0)
         index = tables["index"] / coat
@@ -309,9 +320,19 @@ class _Grating(_Nodes):
             along = self.sum(self.difference(to_light, to_camera), self.scaled(x, 1e-4))
         else:
             along = self.difference(x, self.scaled(half, self.dot(half, x)))
-        colour = self.scaled(self.vector("MULTIPLY", colour, inputs["Tint"]), weight)
-        shaded = self.lobe(colour, alpha_x, alpha_y, half, self.normalised(along))
-        if self.dielectric:
+        tinted = self.vector("MULTIPLY", colour, inputs["Tint"])
+        shaded = self.lobe(self.scaled(tinted, weight), alpha_x, alpha_y, half, self.normalised(along))
+        if self.sheet:
+            to_other = self.difference(to_light, self.scaled(normal, self.multiply(true_c_i, 2.0)))
+            gain, w = self.refracted(self.exchanged(behind, true_c_i, c_o), square_step, reflectances, of_light)
+            transmitted = power_at(w, self.image("transmitted powers", _transmitted(tables).T))
+            width = self.divide(self.multiply(slope, 2.0, width_x), self.math("SQRT", true_c_i))
+            of_sheet = self.refraction(to_camera, to_other, width, behind)
+            self.put(
+                of_sheet.inputs["Color"], self.scaled(tinted, self.multiply(gain, transmitted, chance, propagates))
+            )
+            shaded = self.both(shaded, of_sheet)
+        elif self.dielectric:
             into_base = self.subtract(1.0, self.number(reflectances, of_light, self.texel(c_o, _COSINES)))
             diffuse = self.node("ShaderNodeBsdfDiffuse")
             factor = self.multiply(into_base, _entering(index), entering if coat > 1 else 1.0)
@@ -336,6 +357,51 @@ class _Grating(_Nodes):
         self.put(node.inputs["Normal"], normal)
         self.put(node.inputs["Tangent"], tangent)
         return node.outputs[0]
+
+    def exchanged(self, factor: Any, a: Any, b: Any) -> tuple[Any, Any]:
+        """Return a and b for the factor 0, b and a for 1."""
+        change = self.multiply(factor, self.subtract(b, a))
+        return self.add(a, change), self.subtract(b, change)
+
+    def refracted(
+        self, cosines: tuple[Any, Any], square_step: Any, reflectances: bpy.types.Image, of_light: Any
+    ) -> tuple[Any, Any]:
+        """Return what both faces of a sheet transmit, without the power of the order, and w.
+
+        Args:
+            cosines: outside, at the flat face and at the relief.
+            square_step: |λq|².
+            reflectances: by wavelength and cosine.
+            of_light: coordinate of the wavelength.
+        """
+        flat, relief = cosines
+        excess = float(np.median(self.tables["index"].real)) ** 2 - 1
+        inside = self.math("SQRT", self.math("MULTIPLY_ADD", flat, flat, excess))
+        w = self.subtract(inside, relief)
+        square = self.add(square_step, self.multiply(w, w))
+        of_facet = self.larger(self.subtract(excess, square), 0.0)  # 0: no facet refracts one direction into the other
+        a_flat = self.divide(self.add(square, excess), self.multiply(inside, 2.0))
+        a_relief = self.divide(of_facet, self.multiply(relief, 2.0))
+        larger = self.larger(a_flat, a_relief)
+        g = self.smaller(self.divide(self.multiply(square, 4.0), self.multiply(larger, larger)), 1.0)
+        k = self.divide(self.multiply(a_flat, a_relief), self.multiply(w, w))
+        at_facet = self.smaller(self.divide(of_facet, self.multiply(self.math("SQRT", square), 2.0)), 1.0)
+        lost = (self.number(reflectances, of_light, self.texel(c, _COSINES)) for c in (flat, at_facet))
+        return self.multiply(k, g, *(self.subtract(1.0, each) for each in lost)), w
+
+    def refraction(self, to_camera: Any, to_light: Any, width: Any, behind: Any) -> Any:
+        """Return a lobe of this width, √2 σ, which refracts one direction into another on the other face."""
+        across = self.sum(to_camera, self.scaled(to_light, _REFRACTION))
+        length = self.vector("LENGTH", across)
+        deflected = self.math("MULTIPLY_ADD", self.dot(to_camera, to_light), 1.0, _REFRACTION)
+        stretched = self.multiply(self.math("SQRT", self.divide(deflected, length)), self.divide(_REFRACTION, length))
+        lobe = self.node("ShaderNodeBsdfRefraction", distribution="BECKMANN")
+        exponent = self.math("MULTIPLY_ADD", behind, -2.0, 1.0)  # Cycles inverts the index there
+        self.put(lobe.inputs["IOR"], self.math("POWER", _REFRACTION, exponent))
+        alpha = self.smaller(self.larger(self.multiply(width, stretched), 1e-4), 0.7)
+        self.put(lobe.inputs["Roughness"], self.math("SQRT", alpha))
+        self.put(lobe.inputs["Normal"], self.scaled(across, self.divide(-1.0, length)))
+        return lobe
 
     def inside(self, cosine: Any) -> Any:
         """Return the cosine in the coat of a direction of this cosine outside."""
@@ -420,9 +486,12 @@ def _slots(tables: Mapping[str, np.ndarray]) -> np.ndarray:
     The probability is that of the root mean square of the power over the κ of visible light, which has the least noise
     of all that do not depend on κ.
     """
-    powers = tables["powers"]
+    powers, w = tables["powers"], np.linspace(0.8, 2, 13)
     count, slices = powers.shape
-    kappa = (2 * np.pi / _middle(tables)[:, None] * np.linspace(0.8, 2, 13)).ravel() / float(tables["max_kappa"])
+    if tables.get("sheet"):
+        powers = _transmitted(tables)
+        w = (np.median(tables["index"].real) - 1) * np.linspace(0.9, 1.6, 13)
+    kappa = (2 * np.pi / _middle(tables)[:, None] * w).ravel() / float(tables["max_kappa"])
     at = np.minimum(kappa, 1) * (slices - 1)
     below = np.minimum(at.astype(int), slices - 2)
     shown = powers[:, below] * (1 - at + below) + powers[:, below + 1] * (at - below)
@@ -431,6 +500,12 @@ def _slots(tables: Mapping[str, np.ndarray]) -> np.ndarray:
     order = np.repeat(np.arange(count), numbers)
     chances = len(order) / numbers[order]
     return np.column_stack([tables["frequencies"][order], (order + 0.5) / count, chances])[None]
+
+
+def _transmitted(tables: Mapping[str, np.ndarray]) -> np.ndarray:
+    """Return the powers of the orders at −κ, which are those of −q at κ."""
+    q = tables["frequencies"]
+    return tables["powers"][[np.argmin(((q + each) ** 2).sum(axis=1)) for each in q]]
 
 
 def _albedos_of_orders(tables: Mapping[str, np.ndarray]) -> np.ndarray:
