@@ -26,6 +26,7 @@ SHORTEST_DRAWN, LONGEST_DRAWN = 390.0, 720.0  # nm, outside of which a display n
 _BINS = 48  # of wavelengths
 _MAX_ORDERS = 1000  # among which the shader chooses by their powers
 _ROWS, _COLUMNS = 32, 96  # of the cells of a continuum
+_MAX_DENSITY = 0.05  # of the cells, at one frequency; else order 0 of a disc takes most of them, and few remain between
 _SLICES = (17, 33, 65, 129)  # of κ
 _MAX_SLICE_ERROR = 2e-3  # of the reflected power, of orders; of a continuum, which has more values, ten times as much
 _COSINES, _AZIMUTHS, _LIGHTS = 12, 13, 5  # of the table of albedos of a continuum
@@ -55,7 +56,7 @@ class ShaderTables:
         lobe_width: standard deviation of an order.
         powers: (orders or cells, κ); of cells, multiplied by their number.
         frequencies: of the orders, (orders, 2); of a continuum, none.
-        rows: edges of the rows of cells of equal mean power, (r + 1,); of orders, none.
+        rows: edges of the rows of cells of about equal mean power, (r + 1,); of orders, none.
         columns: edges of the columns in each row, (r, c + 1); of orders, none.
         albedo: what a perfect mirror would reflect, by wavelength, azimuth of ω_o and cos θ_o; of orders, none.
         sheet: whether the orders are those of a film that transmits light, with a flat lower face.
@@ -176,13 +177,14 @@ def _sliced(spectrum: GratingSpectrum, max_kappa: float, of_nodes: Callable[[Rea
 
 
 def _cells(spectrum: GratingSpectrum, max_kappa: float) -> tuple[Real, Real, Callable[[Real], Real]]:
-    """Return edges of rows and columns of cells of equal mean power, and the powers of cells from those of nodes.
+    """Return edges of rows and columns of cells of equal limited mean power, and their powers from those of nodes.
 
     The edges of the rows are (n + 1,), those of the columns in each (n, k + 1), in cycles/µm. Powers are multiplied by
     the number of cells: they are then the weights of a sample that draws all cells with equal probability.
     """
     kappas = np.linspace(0.3, 1, 8) * min(max_kappa, 4e3 * np.pi / SHORTEST_DRAWN)
     mean = np.mean([np.maximum(spectrum.powers(kappa), 0) for kappa in kappas], axis=0)
+    mean = np.minimum(mean, _MAX_DENSITY * mean.sum())
     q_x, q_y = spectrum.grid.frequencies()
     rows, of_rows = _equal_parts(q_y, mean.sum(axis=1), _ROWS)
     pairs = [_equal_parts(q_x, weights @ mean, _COLUMNS) for weights in of_rows]

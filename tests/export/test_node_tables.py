@@ -1,13 +1,16 @@
 """The tables for Blender's own nodes (.npz): what they hold, and colours in its working spaces."""
 
+from types import SimpleNamespace
+
 import colour
 import numpy as np
 import pytest
 from scipy.special import jv
 
-from mitsuba_diffraction.export.shader_tables import SHORTEST_DRAWN, bins_of_wavelengths, shader_recipe
+from mitsuba_diffraction.export.shader_tables import SHORTEST_DRAWN, ShaderTables, bins_of_wavelengths, shader_recipe
 from mitsuba_diffraction.export.working_spaces import WORKING_SPACES, nonnegative_colours
 from mitsuba_diffraction.files.outputs import check_outputs
+from mitsuba_diffraction.optics.media import MediumBelow
 from mitsuba_diffraction.precomputation.requested_surface import RequestedSurface
 
 PERIOD, DEPTH = 1.6, 0.15
@@ -36,6 +39,17 @@ def test_the_tables_of_a_grating_are_its_closed_form(command, tmp_path):
 def test_the_tables_of_a_disc_are_for_light_inside_its_coat(disc):
     recipe = shader_recipe(RequestedSurface.of(disc).recipe)
     assert recipe.settings.wavelengths[0] < SHORTEST_DRAWN / 1.58  # polycarbonate
+
+
+def test_a_bright_order_does_not_take_most_of_the_rows():
+    q = np.linspace(-3, 3, 121)
+    powers = np.full((121, 121), 0.4 / 121**2)
+    powers[60, 60] += 0.6
+    grid = SimpleNamespace(frequencies=lambda: (q, q))
+    spectrum = SimpleNamespace(source="", max_kappa=60.0, lobe_width=0.007, grid=grid, powers=lambda kappa: powers)
+    tables = ShaderTables.of_spectrum(spectrum, MediumBelow.of("none"))
+    assert (np.abs(tables.rows) < 0.03).sum() < 8  # of 33 edges, 19 in proportion to the power
+    np.testing.assert_allclose(tables.powers.mean(axis=0), 1, rtol=1e-3)
 
 
 def test_mixtures_of_neighbouring_wavelengths_keep_luminance_and_colour():
