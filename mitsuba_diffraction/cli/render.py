@@ -381,7 +381,7 @@ def _picture(
         exposure: of the preview; None: `auto_exposure`.
         complete: number of completed pictures, as text to report if Ctrl-C interrupts this one.
     """
-    from ..render.denoise import check_requirements, denoised_picture
+    from ..render.denoise import check_requirements
     from ..render.passes import Finished, Interrupted, deferred_interrupt
     from ..render.passes import render as trace
     from ..render.spectral_image import exposure_of_preview, save_preview, stored_digest
@@ -420,17 +420,7 @@ def _picture(
         raise Stopped(f"{complete}; the same command with --resume continues") from None
     # Written to the end, as no checkpoint holds the last samples.
     with deferred_interrupt() as pressed:
-        try:
-            if _is_spectral(path):
-                with stage("writing"):
-                    image.save(path, **request.stored)
-            with stage("preview"):
-                clean = partial(denoised_picture, scenes[0]) if scenes else None
-                exposure = save_preview(image, preview, exposure, clean, view)
-        except (OSError, RuntimeError) as error:
-            kept = f"; {checkpoint} is kept, and --resume continues from it" if checkpoint.exists() else ""
-            written = f"{path} or its preview" if _is_spectral(path) else str(path)
-            raise RuntimeError(f"{written} cannot be written ({error}){kept}") from error
+        exposure = _write(rendering, image, path, exposure, scenes)
     if interrupted:
         spp = image.attributes["spp"]
         raise Stopped(f"{path} holds {spp} samples per pixel; the same command with --resume continues")
@@ -439,6 +429,32 @@ def _picture(
     if pressed():
         raise Stopped(f"{path} is complete")
     return exposure
+
+
+def _write(
+    rendering: _Rendering, image: SpectralImage, path: Path, exposure: float | None, scenes: list[mi.Scene]
+) -> float:
+    """Write a picture and its preview, denoised by the guides of the scene, if there is one; return its exposure.
+
+    Raises:
+        RuntimeError: if one of them cannot be written.
+    """
+    from ..render.denoise import denoised_picture
+    from ..render.spectral_image import save_preview
+    from ..render.sums import checkpoint_path
+
+    try:
+        if _is_spectral(path):
+            with stage("writing"):
+                image.save(path, **rendering.request.stored)
+        with stage("preview"):
+            clean = partial(denoised_picture, scenes[0]) if scenes else None
+            return save_preview(image, _preview(path), exposure, clean, rendering.view)
+    except (OSError, RuntimeError) as error:
+        checkpoint = checkpoint_path(path)
+        kept = f"; {checkpoint} is kept, and --resume continues from it" if checkpoint.exists() else ""
+        written = f"{path} or its preview" if _is_spectral(path) else str(path)
+        raise RuntimeError(f"{written} cannot be written ({error}){kept}") from error
 
 
 def _report(rendering: _Rendering, image: SpectralImage, path: Path, exposure: float, seconds: float) -> str:

@@ -298,8 +298,16 @@ def concerns(
         )
     if warning := scalar.warning:
         found.append(f"{warning[0].upper()}{warning[1:]}.")
-    if not measured:
-        return tuple(found)
+    if measured:
+        found += _concerns_of_a_scan(height_field, numbers, coherence_length, extent)
+    return tuple(found)
+
+
+def _concerns_of_a_scan(
+    height_field: HeightField, numbers: Statistics, coherence_length: float, extent: str
+) -> list[str]:
+    """Return concerns about how a surface was measured; for arguments see `concerns`."""
+    found = []
     width = min(height_field.tile_size)
     if extent == "sample" and width < _MIN_WAVELENGTHS * _GREEN:
         lobe = np.degrees(_GREEN * lobe_width(coherence_length))
@@ -344,7 +352,7 @@ def concerns(
             f"One sloping pixel in a hundred is steeper than {numbers.steepest:.0f}°: light is reflected more than "
             "once there, which is not computed, and a tip does not reach down such walls."
         )
-    return tuple(found)
+    return found
 
 
 def _fraction_at_limit(height_field: HeightField) -> float:
