@@ -26,7 +26,7 @@ class Colours {
 
   // Uniforms of shading.js besides those of the spectrum.
   uniforms() {
-    return { ...this.shown, uStretch: STRETCH, uRangeW: this.range };
+    return { ...this.shown, uStretch: STRETCH, uEdge: Math.asinh(MAX_U / STRETCH), uRangeW: this.range };
   }
 
   rangeW(state) {

@@ -24,7 +24,7 @@ class Side {
   programOf(state) {
     const constants = this.constants(state);
     if (!this.programs.has(constants)) {
-      this.programs.set(constants, new Program(this.gl, SHADERS.quad_vertex, constants, this.text, SHADERS.shade));
+      this.programs.set(constants, new Program(this.gl, SHADERS.circle_vertex, constants, this.text, SHADERS.shade));
     }
     return this.programs.get(constants);
   }
@@ -37,8 +37,10 @@ class Side {
 
   restart() {
     Object.assign(this, { frame: 0, row: 0, spent: 0 });
-    this.means[1].bind();
-    this.gl.clearBufferfv(this.gl.COLOR, 0, [0, 0, 0, 0]);
+    for (const target of this.means) {
+      target.bind();
+      this.gl.clearBufferfv(this.gl.COLOR, 0, [0, 0, 0, 0]);
+    }
   }
 
   // The mean that is shown: of all whole frames, or the first one as far as it is drawn.
@@ -64,7 +66,7 @@ class Renderer {
     this.data = data;
     this.spectrum = new Spectrum(gl, data.spectrum, tables.table, tables.metals);
     this.matching = numbers2D(gl, tables.light, 471, 1, 4);
-    this.analytic = new Program(gl, SHADERS.quad_vertex, SHADERS.analytic);
+    this.analytic = new Program(gl, SHADERS.circle_vertex, SHADERS.analytic);
     this.mesh = new Program(gl, SHADERS.mesh_vertex, SHADERS.scales, SHADERS.mesh);
     this.screen = new Program(gl, SHADERS.quad_vertex, SHADERS.ground, SHADERS.display);
     const constants = (state) => this.constants(state);
@@ -145,6 +147,18 @@ class Renderer {
     gl.drawArrays(gl.TRIANGLES, 0, 3);
   }
 
+  // Draws where the shape is seen: in a circle about the middle, as some renderers shade what is beside it as well.
+  shape(state, camera) {
+    const { gl } = this;
+    const [width, height] = this.drawn;
+    const radius = RADII[state.shape] ?? Infinity, whole = Math.hypot(width, height) / 2;
+    const seen = radius < state.distance ? radius / Math.sqrt(state.distance ** 2 - radius ** 2) / camera.tangents[0] : Infinity;
+    const reach = Math.ceil(Math.min((seen * width) / 2, whole)) + 1;  // a pixel for the jitter
+    gl.viewport(Math.round(width / 2) - reach, Math.round(height / 2) - reach, 2 * reach, 2 * reach);
+    gl.bindVertexArray(this.empty);
+    gl.drawArrays(gl.TRIANGLE_FAN, 0, 16);
+  }
+
   // Positions and normals of a frame, where they are not there already.
   drawGeometry(state, camera, frame) {
     if (frame === this.geometryFrame) return;
@@ -153,6 +167,7 @@ class Renderer {
     const [width, height] = this.drawn;
     const jitter = frame === 0 ? [0, 0] : R2.map((step) => fraction(0.5 + frame * step) - 0.5);
     this.geometry.bind(width, height);
+    for (let i = 0; i < 3; i++) gl.clearBufferfv(gl.COLOR, i, [0, 0, 0, 0]);
     if (state.shape in ANALYTIC) {
       gl.disable(gl.DEPTH_TEST);
       this.analytic.use({
@@ -166,10 +181,9 @@ class Renderer {
         uWall: [PLATE.height, PLATE.side, PLATE.wall, 0],
         uRings: this.data.rings || [0, 0, 1],
       });
-      this.quad();
+      this.shape(state, camera);
       return;
     }
-    for (let i = 0; i < 3; i++) gl.clearBufferfv(gl.COLOR, i, [0, 0, 0, 0]);
     gl.clearBufferfi(gl.DEPTH_STENCIL, 0, 1, 0);
     gl.enable(gl.DEPTH_TEST);
     gl.enable(gl.CULL_FACE);
@@ -211,7 +225,7 @@ class Renderer {
       const rows = Math.min(side.band, height - side.row);
       gl.scissor(left, side.row, Math.max(right - left, 1), rows);
       after.bind(width, height);
-      this.quad();
+      this.shape(state, camera);
       after.read(left, side.row, 1, 1);  // waits until it is drawn
       side.row += rows;
       const spent = performance.now() - now;

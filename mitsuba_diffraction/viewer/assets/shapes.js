@@ -2,6 +2,7 @@
 
 const SCALES = { none: 0, elaphe: 1, xenopeltis: 2 };
 const ANALYTIC = { sphere: 0, plate: 1, disc: 2, wall: 3 };
+const RADII = { sphere: 1, disc: 1, plate: Math.SQRT2 };  // of what encloses them; others may fill the picture
 const GROUND_HEIGHTS = { sphere: -1, plate: -0.06, disc: -0.06 };
 const FOOTPRINT = { size: 96, edge: 1.6, blur: 2 };  // texels, half the edge, texels; see ground.glsl
 

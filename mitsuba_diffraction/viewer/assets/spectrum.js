@@ -109,7 +109,7 @@ class Spectrum {
     const dielectric = state.material === "dielectric";
     return `const int KIND = ${this.kindAt(state)};
 const int MATERIAL = ${dielectric ? 0 : metal ? 1 : 2};
-const bool CUBIC = ${this.terms === 4}, HAS_BASE = ${state.hasBase && dielectric};
+const bool CUBIC = ${this.terms === 4}, HAS_BASE = ${state.hasBase && dielectric}, HAS_COAT = ${state.coat > state.air};
 `;
   }
 

@@ -4,7 +4,7 @@ import {
   DataArrayTexture, DataTexture, DataUtils, FloatType, HalfFloatType, LinearFilter, LinearMipmapLinearFilter,
   MeshStandardMaterial, NearestFilter, RGBAFormat, ShaderChunk, Vector2,
 } from 'three';
-import { SHADING, drawnOfTable } from './shading.js';
+import { MAX_U, SHADING, drawnOfTable } from './shading.js';
 
 const VERSION = 3;
 const SAMPLES = 256;  // of a sky, by a table
@@ -45,7 +45,7 @@ export class DiffractionData {
     const uColours = new DataArrayTexture(halves, size, size, layers);
     Object.assign(uColours, { format: RGBAFormat, type: HalfFloatType, magFilter: LinearFilter });
     Object.assign(uColours, { minFilter: LinearMipmapLinearFilter, generateMipmaps: true, needsUpdate: true });
-    return { uColours, uRangeW: new Vector2(...this.range_w), uStretch: this.stretch, uDrawn: loaded(drawnOfTable(sums, size, this.stretch, SAMPLES), SAMPLES, 1) };
+    return { uColours, uRangeW: new Vector2(...this.range_w), uStretch: this.stretch, uEdge: Math.asinh(MAX_U / this.stretch), uDrawn: loaded(drawnOfTable(sums, size, this.stretch, SAMPLES), SAMPLES, 1) };
   }
 
   #orders({ frequencies, powers, light, reflectance }) {
@@ -101,7 +101,8 @@ export async function loadDiffraction(url) {
 }
 
 /** GLSL of f for the data of a surface, see shading.js: ofLamp(c, a, b, isDisc, wo) is XYZ. */
-export const shadingOf = (data) => `${data.kind === 'orders' ? '#define ORDERS\n' : ''}${SHADING}
+export const shadingOf = (data) => `${data.kind === 'orders' ? '#define ORDERS\n' : ''}const bool HAS_COAT = ${data.coat > 1}, HAS_BASE = true;
+${SHADING}
 vec3 toRGB(vec3 XYZ) { return mat3(3.2406, -0.9689, 0.0557, -1.5372, 1.8758, -0.2040, -0.4986, 0.0415, 1.0570) * XYZ; }
 #ifdef ORDERS
 uniform highp sampler2D uPowers;
@@ -249,7 +250,7 @@ export class DiffractionMaterial extends MeshStandardMaterial {
       .replace('#include <opaque_fragment>', `${GAMUT}\n$&`);
   }
 
-  customProgramCacheKey() { return `diffraction ${this.diffraction?.kind}`; }
+  customProgramCacheKey() { return `diffraction ${this.diffraction?.kind} ${this.diffraction?.coat > 1}`; }
 
   // The sizes of the lamps, in the order in which three.js has them.
   onBeforeRender(renderer, scene) {

@@ -2,6 +2,7 @@
 // and for the live page. Symbols are those of colour_table.py: u = −(ω_i + ω_o)_∥ and w = n (cos θ_i + cos θ_o) next to
 // the relief, f = K G T_i T_o C(u, w) + (1 − R_i)(1 − R_o) base/π. Directions are unit vectors along the axes of the
 // pattern, z the normal, both away from the surface and outside of a coat, which keeps their tangential components.
+// HAS_COAT and HAS_BASE are constants of the program, as some renderers execute both branches of a condition.
 // Lengths are in µm, colours XYZ under D65. C is a table, or with ORDERS a sum over separate orders.
 
 export const SHADING = /* glsl */ `
@@ -39,7 +40,7 @@ float dielectricOf(float cosine, float eta) {
 
 // The face of the coat, at the cosine outside.
 float face(float cosine) {
-  return uCoat == 1.0 ? 0.0 : dielectricOf(cosine, uCoat);
+  return HAS_COAT ? dielectricOf(cosine, uCoat) : 0.0;
 }
 
 // What enters a dielectric, through its coat.
@@ -47,13 +48,15 @@ float transmittance(float cosine) {
   return (1.0 - face(cosine)) * (1.0 - dielectricOf(min(inner(cosine) / uCoat, 1.0), uEta));
 }
 
-// K G from cos^2 of both directions and |lambda q|^2.
+// K G from k_z of both directions and |lambda q|^2.
+float kGOf(vec2 k, float tangentSquare) {
+  float vz = k.x + k.y, a = tangentSquare + vz * vz;
+  return a / (vz * max(k.x, k.y)) * min(a / (4.0 * vz * min(k.x, k.y)), 1.0);
+}
+
+// The same from cos^2.
 float kG(vec2 squares, float tangentSquare) {
-  vec2 k = sqrt(max(squares + (uCoat * uCoat - 1.0), 1e-12));
-  float vz = k.x + k.y;
-  vec2 a = (tangentSquare + vz * vz) / (2.0 * k);
-  float perVz = 1.0 / vz;
-  return min(a.x * perVz * (a.y * perVz), 2.0 * min(a.x, a.y) * perVz);
+  return kGOf(sqrt(max(squares + (uCoat * uCoat - 1.0), 1e-12)), tangentSquare);
 }
 
 // Of the lobe of an order near its Rayleigh anomaly (optics/geometry.py of the package).
@@ -202,31 +205,34 @@ float partsOf(float size, vec2 u) {
 uniform highp sampler2DArray uColours;  // C; u = a sinh(x), layers over w
 uniform vec2 uRangeW;                   // of the first and the last layer
 uniform float uStretch;                 // a
+uniform float uEdge;                    // x where u is MAX_U
 
-// The distances between nodes at u.
-vec2 spacingAt(vec2 u) {
-  return sqrt(u * u + uStretch * uStretch) * 2.0 * asinh(MAX_U / uStretch) / float(textureSize(uColours, 0).x - 1);
+// Of the distances between nodes at u.
+vec2 squareOfSpacing(vec2 u) {
+  float perNode = 2.0 * uEdge / float(textureSize(uColours, 0).x - 1);
+  return (u * u + uStretch * uStretch) * (perNode * perNode);
 }
 
 // K G C, the mean over a part of a lamp: u has the covariance (a, b; b, c), about that of a texel of a lower level.
 vec3 coloursOf(vec3 wi, vec3 wo, vec3 spread) {
   vec2 u = -(wi.xy + wo.xy);
-  float w = inner(wi.z) + inner(wo.z);
+  vec2 k = vec2(inner(wi.z), inner(wo.z));
+  float w = k.x + k.y;
   vec3 size = vec3(textureSize(uColours, 0));
-  vec2 x = abs(u) / uStretch, warped = sign(u) * log(x + sqrt(x * x + 1.0)) / (2.0 * asinh(MAX_U / uStretch)) + 0.5;
+  vec2 x = abs(u) / uStretch, warped = sign(u) * log(x + sqrt(x * x + 1.0)) / (2.0 * uEdge) + 0.5;
   vec2 at = (clamp(warped, 0.0, 1.0) * (size.xy - 1.0) + 0.5) / size.xy;
   float layer = clamp((w - uRangeW.x) / (uRangeW.y - uRangeW.x), 0.0, 1.0) * (size.z - 1.0), below = min(floor(layer), size.z - 2.0);
-  vec2 texels = 2.0 * sqrt(spread.xz) / spacingAt(u);
-  float level = log2(max(min(texels.x, texels.y), 1.0));
+  vec2 texels = spread.xz / squareOfSpacing(u);
+  float level = 0.5 * log2(max(4.0 * min(texels.x, texels.y), 1.0));
   vec3 low = textureLod(uColours, vec3(at, below), level).rgb, high = textureLod(uColours, vec3(at, below + 1.0), level).rgb;
-  return mix(low, high, layer - below) * kG(vec2(wi.z * wi.z, wo.z * wo.z), dot(u, u));
+  return mix(low, high, layer - below) * kGOf(k, dot(u, u));
 }
 
 const float MAX_DISC_PARTS = 19.0;
 
 float partsOf(float size, vec2 u) {
-  vec2 spacing = spacingAt(u);
-  return min(ceil(size / min(spacing.x, spacing.y)), 6.0);
+  vec2 squares = squareOfSpacing(u);
+  return min(ceil(size * inversesqrt(min(squares.x, squares.y))), 6.0);
 }
 
 #endif
@@ -235,38 +241,42 @@ float partsOf(float size, vec2 u) {
 vec3 ofPart(vec3 wi, vec3 wo, vec3 p, vec3 q, float throughBase) {
   float factor = throughCoat(wi, wo);
   vec3 total = vec3(0.0);
-  if (throughBase > 0.0 && wi.z > 0.0) total = throughBase * transmittance(wi.z) / PI * baseColour;
+  if (HAS_BASE && throughBase > 0.0 && wi.z > 0.0) total = throughBase * transmittance(wi.z) / PI * baseColour;
   vec3 spread = vec3(p.x * p.x + q.x * q.x, p.x * p.y + q.x * q.y, p.y * p.y + q.y * q.y);
   if (factor > 0.0) total += factor * coloursOf(wi, wo, spread);
   return max(wi.z, 0.0) * total;
 }
 
 // The light of a lamp that shines from c + s a + t b, s and t from -1 to 1 or in a disc, relative to its irradiance on
-// a plane that faces c: a disc is a Gaussian, or 7 or 19 of them, a rectangle has them in rows, half of their
+// a plane that faces c: a disc is a Gaussian, or 4, 7 or 19 of them, a rectangle has them in rows, half of their
 // distance wide, all with the variance of the lamp.
 vec3 ofLamp(vec3 c, vec3 a, vec3 b, bool isDisc, vec3 wo) {
-  float perDistance = inversesqrt(dot(c, c)), throughBase = baseColour == vec3(0.0) ? 0.0 : transmittance(max(wo.z, 0.0));
+  float perDistance = inversesqrt(dot(c, c)), throughBase = !HAS_BASE || baseColour == vec3(0.0) ? 0.0 : transmittance(max(wo.z, 0.0));
   vec3 total = vec3(0.0), middle = c * perDistance, n = cross(a, b);
   vec2 u = -(middle.xy + wo.xy), sizes = vec2(length(a), length(b)) * perDistance;
   vec2 counts = max(max(vec2(partsOf(sizes.x, u), partsOf(sizes.y, u)), ceil(12.0 * sizes)), 1.0);
-  if (isDisc) counts = vec2(counts.x == 1.0 ? 1.0 : counts.x <= 3.0 ? 7.0 : MAX_DISC_PARTS, 1.0);
+  if (isDisc) counts = vec2(counts.x == 1.0 ? 1.0 : counts.x == 2.0 ? 4.0 : counts.x == 3.0 ? 7.0 : MAX_DISC_PARTS, 1.0);
   vec2 squares = counts * counts, shrink = sqrt(max(squares - 3.0, 0.0) / max(squares - 1.0, 1.0));
   vec2 width = mix(1.0 / counts, vec2(0.577), equal(counts, vec2(1.0)));
-  if (isDisc) width = vec2(counts.x == 1.0 ? 0.5 : counts.x == 7.0 ? 0.3035 : 0.18);
+  if (isDisc) width = vec2(counts.x == 1.0 ? 0.5 : counts.x == 4.0 ? 0.3 : counts.x == 7.0 ? 0.3035 : 0.18);
   float facing = abs(dot(n, middle));
+  // In rings of 4, or of 1, 6 and 12: 60 degrees between 6, then 30 from 15 on.
+  bool isRing = counts.x == 4.0;
+  float radius = isRing ? 0.566 : counts.x == 7.0 ? 0.607 : 0.38;
+  vec2 ray = vec2(1.0, 0.0), between = isRing ? vec2(0.0, 1.0) : vec2(0.5, 0.8660254);
   for (int j = 0; j < int(counts.y); j++) {
     for (int i = 0; i < int(counts.x); i++) {
       vec2 place = ((2.0 * vec2(i, j) + 1.0) / counts - 1.0) * shrink;
-      // In rings of 1, 6 and 12.
-      float turn = 2.0 * PI * (i < 7 ? float(i) / 6.0 : (float(i) + 0.5) / 12.0);
-      if (isDisc) place = (i == 0 ? 0.0 : i > 6 ? 0.76 : counts.x > 7.0 ? 0.38 : 0.607) * vec2(cos(turn), sin(turn));
+      vec2 step = i < 7 ? between : i == 7 ? vec2(0.9659258, 0.2588190) : vec2(0.8660254, 0.5);
+      ray = mat2(step.x, step.y, -step.y, step.x) * ray;
+      if (isDisc) place = (i == 0 && !isRing ? 0.0 : i > 6 ? 0.76 : radius) * ray;
       vec3 d = c + place.x * a + place.y * b;
       float perLength = inversesqrt(dot(d, d)), ratio = perLength / perDistance;
       vec3 wi = d * perLength, part = ofPart(wi, wo, width.x * perLength * a, width.y * perLength * b, throughBase);
-      total += part * (facing > 0.0 ? ratio * ratio * abs(dot(n, wi)) / facing : 1.0);
+      total += part * (facing > 0.0 ? ratio * ratio * abs(dot(n, wi)) : 1.0);
     }
   }
-  return total / (counts.x * counts.y);
+  return total / (counts.x * counts.y * (facing > 0.0 ? facing : 1.0));
 }
 
 vec3 underSky(vec3 XYZ, vec3 wi, float solidAngle);  // XYZ times the radiance of the sky about wi, of the program
@@ -306,7 +316,7 @@ vec3 ofSky(vec3 wo, int first, int count) {
 }
 `;
 
-const MAX_U = 2;
+export const MAX_U = 2;
 export const SAMPLES = 1024;  // of a sky, of many frames
 const [LOW, HIGH, STEPS] = [1000 / 740, 1000 / 380, 48];
 
