@@ -1,7 +1,7 @@
 // f = T_i T_o R K G S(q; kappa)/lambda^2 + (1 - R_i)(1 - R_o) base/pi, in 1/sr: bsdf/orders.py, bsdf/continuum.py,
 // bsdf/directions.py, bsdf/coat.py and optics/geometry.py of the package, for reflected light. E is one. It follows
-// shading.js. KIND, MATERIAL, CUBIC, HAS_BASE and HAS_COAT are constants of the program (spectrum.js), since some renderers execute
-// both branches of a condition.
+// shading.js. KIND, MATERIAL, CUBIC, HAS_BASE and HAS_COAT are constants of the program (spectrum.js), since some
+// renderers execute both branches of a condition.
 
 uniform highp sampler2DArray uTable;  // a_p of c = sum_p a_p t^p: columns m_x, rows m_y, layers intervals of kappa
 uniform float uUnit;                  // factor of the table
