@@ -248,9 +248,12 @@ def test_a_rectangle_lights_by_its_area(name, exported, tab):
     error = difference(found[inside], mixed(middle)[inside])
     assert error.mean() < 1
     assert np.percentile(error, 95) < 5
-    # The lobes of the foil are too narrow for these sums.
-    if name == "skin":
-        assert summed[is_inside(seen(fine)), 1].sum() / fine**2 == pytest.approx(flux, rel=0.03)
+    # The lobes of the foil are too narrow for these sums, but so narrow that they are directions beside the lamp.
+    on_plane = is_inside(seen(fine))
+    if name != "skin":
+        flux = in_narrow_orders(surface, seen(fine)[on_plane], position, width / 2 * x, height / 2 * np.cross(z, x))
+        flux /= fine**2
+    assert summed[on_plane, 1].sum() / fine**2 == pytest.approx(flux, rel=0.03)
 
 
 def is_inside(points):
@@ -264,6 +267,36 @@ def from_point(surface, colours, points, position, normal):
     wi = unit(away)
     per_area = (wi @ normal)[:, None] / (away**2).sum(axis=1, keepdims=True)
     return f_cos(surface, colours, wi, unit(EYE - points)) * per_area
+
+
+def in_narrow_orders(surface, points, position, x, y):
+    """Y of the light of a rectangle of radiance one, summed over points, by its images in each order; no coat.
+
+    Half of its width and of its height are x and y. Lobes are directions, λ² d²q = cos θ_i dω_i.
+    """
+    strong = surface.powers(20.0).ravel() > 1e-4
+    q = np.stack(np.meshgrid(*surface.spectrum.grid.frequencies()), -1).reshape(-1, 2)[strong]
+    step, nodes, normal, wo, total = 6.0, np.linspace(0, 2, 9), np.cross(x, y), unit(EYE - points), 0.0
+    nm, everything = np.arange(380 + step / 2, 740, step), np.arange(360.0, 831.0)
+    light = matching_functions(nm)[:, 1] * daylight(nm) * step
+    light /= matching_functions(everything)[:, 1] @ daylight(everything)
+    for wavelength, luminance in zip(nm * 1e-3, light, strict=True):
+        powers = np.stack([surface.powers(2 * np.pi * w / wavelength).ravel()[strong] for w in nodes], axis=1)
+        for u, power in zip(wavelength * q, powers, strict=True):
+            tangent = -(wo[:, :2] + u)
+            ki = np.sqrt(np.maximum(1 - (tangent**2).sum(axis=1), 1e-9))
+            wi = np.concatenate([tangent, ki[:, None]], axis=1)
+            distance = ((position - points) @ normal / (wi @ normal))[:, None]
+            at = points + distance * wi - position
+            hit = (ki > 1e-3) & (distance[:, 0] > 0) & (np.abs(at @ x) <= x @ x) & (np.abs(at @ y) <= y @ y)
+            ki, ko = ki[hit], wo[hit, 2]
+            w = ki + ko
+            square = u @ u + w**2
+            a, b = square / (2 * ki), square / (2 * ko)
+            k_g = np.minimum(a * b / w**2, 2 * np.minimum(a, b) / w)
+            reflectance = surface.reflectance(wavelength, np.broadcast_to(u, (len(w), 2)), w)
+            total += luminance * (np.interp(w, nodes, power) * k_g * reflectance).sum()
+    return total
 
 
 @pytest.mark.slow
