@@ -25,7 +25,7 @@ def refused(**settings):
 def mean_of_picture(path):
     """The mean of the middle of a small picture of the open file, its cube under its lamp and a grey sky."""
     scene = bpy.context.scene
-    scene.render.engine, scene.cycles.device, scene.cycles.samples = "CYCLES", "CPU", 16
+    scene.render.engine, scene.cycles.device, scene.cycles.samples = "CYCLES", "CPU", 256
     scene.render.resolution_x = scene.render.resolution_y = 32
     scene.render.image_settings.file_format, scene.render.filepath = "OPEN_EXR", path
     bpy.ops.render.render(write_still=True)

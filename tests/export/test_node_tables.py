@@ -48,7 +48,7 @@ def test_a_bright_order_does_not_take_most_of_the_rows():
     grid = SimpleNamespace(frequencies=lambda: (q, q))
     spectrum = SimpleNamespace(source="", max_kappa=60.0, lobe_width=0.007, grid=grid, powers=lambda kappa: powers)
     tables = ShaderTables.of_spectrum(spectrum, MediumBelow.of("none"))
-    assert (np.abs(tables.rows) < 0.03).sum() < 8  # of 33 edges, 19 in proportion to the power
+    assert (np.abs(tables.rows) < 0.03).sum() < 12  # of 33 edges, 19 in proportion to the power
     np.testing.assert_allclose(tables.powers.mean(axis=0), 1, rtol=1e-3)
 
 
