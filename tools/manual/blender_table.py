@@ -1,9 +1,10 @@
 """Renders gratings on a table by nodes in Cycles and path traced: blender_nodes.png and blender_paths.png in FOLDER.
 
-    python tools/manual/blender_table.py FOLDER [WIDTH [SAMPLES]]
+    python tools/manual/blender_table.py FOLDER [WIDTH [SAMPLES [OF_DISC]]]
 
 $BLENDER_PYTHON is a Python with bpy (tools/manual/cycles_picture.py). Both pictures have direct light alone, and
-are denoised by Open Image Denoise. Lengths are cm.
+are denoised by Open Image Denoise. Cycles renders the disc, of which a sample seldom hits a lamp, once more with
+OF_DISC samples, as a render region. Lengths are cm.
 """
 
 import json
@@ -39,6 +40,7 @@ PAINTS = {
 LAMPS = tuple((place, (0, 0, 0), 3.5, 300) for place in ((-16, 24, 34), (16, 12, 38), (-4, -2, 44)))
 SKY, EXPOSURE = 0.05, -2.3  # of both pictures, stops
 EYE, TARGET, FIELD = (0.5, -34, 27), (0.5, -0.6, 0.6), 37
+REGION = (0.555, 0.955, 0.435, 0.85)  # of the disc: left, right, bottom, top
 
 
 def placed(x, y, z, scale=1.0, degrees=0.0, flattened=1.0):
@@ -160,12 +162,13 @@ def scene_file(folder, width):
     return path
 
 
-def main(folder, width=1280, samples=192):
+def main(folder, width=1280, samples=192, of_disc=512):
     folder.mkdir(exist_ok=True)
     meshes(folder)
     tables(folder)
     scene = {"objects": OBJECTS, "paints": PAINTS, "pigment": PIGMENT, "lamps": LAMPS, "sky": SKY}
     scene |= {"eye": EYE, "target": TARGET, "field": FIELD, "width": width, "samples": samples}
+    scene |= {"region": REGION, "of_disc": of_disc}
     (folder / "scene.json").write_text(json.dumps(scene))
     script = Path(__file__).with_name("blender_table_in_cycles.py")
     subprocess.run([os.environ["BLENDER_PYTHON"], str(script), str(folder)], check=True)

@@ -96,11 +96,24 @@ def main(folder):
     width, height = of["width"], of["width"] * 9 // 16
     scene.render.resolution_x, scene.render.resolution_y = width, height
     scene.render.image_settings.file_format, scene.render.image_settings.color_depth = "OPEN_EXR", "32"
-    scene.render.filepath = os.path.join(folder, "cycles.exr")
+    found = rendered(scene, os.path.join(folder, "cycles.exr"))
+    left, right, bottom, top = (round(x * n) for x, n in zip(of["region"], (width, width, height, height), strict=True))
+    limits = scene.render
+    limits.border_min_x, limits.border_max_x, limits.border_min_y, limits.border_max_y = of["region"]
+    limits.use_border, cycles.samples = True, of["of_disc"]
+    region = np.s_[height - top + 1 : height - bottom - 1, left + 1 : right - 1]  # Cycles rounds in its own way
+    found[region] = rendered(scene, os.path.join(folder, "disc.exr"))[region]
+    np.save(os.path.join(folder, "cycles.npy"), found)
+
+
+def rendered(scene, path):
+    """Linear sRGB, (rows, columns, 3)."""
+    scene.render.filepath = path
     bpy.ops.render.render(write_still=True)
-    values = np.empty(4 * width * height, np.float32)
-    bpy.data.images.load(scene.render.filepath).pixels.foreach_get(values)
-    np.save(os.path.join(folder, "cycles.npy"), values.reshape(height, width, 4)[::-1, :, :3])
+    image = bpy.data.images.load(path)
+    values = np.empty(4 * image.size[0] * image.size[1], np.float32)
+    image.pixels.foreach_get(values)
+    return values.reshape(image.size[1], image.size[0], 4)[::-1, :, :3].copy()
 
 
 if __name__ == "__main__":
