@@ -129,7 +129,7 @@ def in_cycles(shader, shape, light, samples, folder, *space):
 
 def version_of_blender():
     said = subprocess.run([BLENDER, "-c", "import bpy; print(bpy.app.version)"], capture_output=True, text=True)
-    return tuple(map(int, re.findall(r"\d+", said.stdout)))
+    return tuple(map(int, re.findall(r"\d+", said.stdout.rpartition("(")[2])))  # after what Blender logs
 
 
 @pytest.mark.slow
