@@ -11,7 +11,8 @@ with the gain Γ of lobes at the horizon. a is summed over components of S, each
 
       cos θ → √(2λσ_q) m(x),    m(x) = ∫₀^∞ g(x) g(y) φ(x − y) √((x + y)/2) dy,    x = cos² θ/(2λσ_q)
 
-  with the `horizon_gain` g; m(x) → √x away from the horizon.
+  with the `horizon_gain` g; m(x) → √x away from the horizon. Where ω is near the horizon, too, both cosines vary
+  together within the lobe, over which K G Γ η_m is integrated.
 - Where orders overlap, and for a sample, a bin of the frequency plane, in which S is accumulated. The part of its
   radial extent that is above the horizon determines its weight and its cosine. Near the mirror direction at grazing
   incidence (1 − b) K G + b Γ replaces K G, as in `Geometry.continuum_factor` of `bsdf/directions.py`.
@@ -56,6 +57,10 @@ MAX_MIRROR_BIN_WIDTH = 0.5  # within the lobe of the mirror direction, in σ_q
 MAX_NODE_POINTS = 6  # on each side along x and y, for a node of S wider than half a bin
 MAX_LOBE_PHASE = 0.1  # radians within one σ of the lobe of an order, above which it is evaluated at several points
 LOBE_POINTS = 9
+MAX_GRAZING = 4.0  # cos² θ/(2λσ_q) of ω and of an order, below which both cosines vary within its lobe
+MIN_POINTS, MAX_POINTS = 7, 24  # in √cos θ_o of such a lobe; one more for each four radians of phase
+MAX_SIGMAS = 3.0
+ACROSS, MAX_ACROSS = 3, 2.2  # points and their cutoff, σ, of the cosine of ω at a given cos θ_o
 MIN_SINGLE_CONTRAST = 0.01  # |η − 1| below which v_z of transmitted light cancels too much for single precision
 MIN_COS_ONE_POINT = 0.25  # cos θ_o below which a bin is evaluated at three points
 MAX_PAIRS = 1 << 17  # (direction, component) evaluated at once, so that they fit into the cache
@@ -230,10 +235,13 @@ class Furnace:
 
         Order j diffracts light from ω to k_o,∥ = −ω_∥ − λ q_j, or −ω_∥ + λ q_j in branch −1, in units of n_i.
         """
-        (term,) = self._terms(directions, length, branch)
-        planes = self._planes
-        factor = term.factor * planes[len(planes) // 2](term.cosine)[abs(branch)]
-        return term.direction, term.component, factor * self._power(term.component, term.kappa, branch)
+        plane, count = self._planes[len(self._planes) // 2], len(self.q)
+        totals = np.zeros(len(directions) * count)
+        for term in self._terms(directions, length, branch):
+            value = term.factor * plane(term.cosine)[abs(branch)] * self._power(term.component, term.kappa, branch)
+            totals += np.bincount(term.direction * count + term.component, value, len(totals))
+        found = np.flatnonzero(totals)
+        return found // count, found % count, totals[found]
 
     def _terms(self, directions: Real, length: Real, branch: int) -> list[_Terms]:
         """Return the `terms` without R or T and powers, in parts."""
@@ -256,19 +264,43 @@ class Furnace:
             return self._bin_terms(cos_i, length, near, np.sqrt(np.maximum(1 - square, 0)), branch)
         i, j = np.nonzero(square > 0)
         square, j = square[i, j], near[j]
-        width = self.lobe_scale * self.spectrum.lobe_width
-        sigma = length[i] * width
-        cos_exit = cos_o = mean_cosine(square, sigma / index)
-        weight: Real | float = 1.0
-        if 2 * np.pi * self.spectrum.height_range * self.height_scale * width > MAX_LOBE_PHASE:
-            cos_exit, cos_o, weight = _over_lobe(square, sigma / index)
-            i, j, sigma = np.tile(i, LOBE_POINTS), np.tile(j, LOBE_POINTS), np.tile(sigma, LOBE_POINTS)
-        cos_i, length = cos_i[i], length[i]
-        mean_cos_i = mean_cosine(cos_i**2, sigma)
-        value, cosine = self._factor(mean_cos_i, cos_o, length, length**2 * (q**2).sum(-1)[j], branch)
+        sigma = length[i] * (self.lobe_scale * self.spectrum.lobe_width)
+        grazing = np.maximum(cos_i[i] ** 2, index * square) < 2 * MAX_GRAZING * sigma
+        parts = [(part, both) for part, both in ((~grazing, False), (grazing, True)) if part.any()]
+        return [self._order_terms(s, length, i[part], j[part], square[part], branch, both) for part, both in parts]
+
+    def _order_terms(
+        self, s: Real, length: Real, i: Indices, j: Indices, square: Real, branch: int, grazing: bool
+    ) -> _Terms:
+        """Compute the `_terms` of orders j of directions i, whose centres have cos² θ_o = `square` > 0, (n,) each.
+
+        Args:
+            s, length: ω_∥ and λ of all directions.
+            i, j, square: of the pairs.
+            branch: see `branches`.
+            grazing: whether both directions are near the horizon, so that their cosines vary together within a lobe.
+        """
+        index, width = (branch and self.index) or 1.0, self.lobe_scale * self.spectrum.lobe_width
+        cos_i, sigma = np.sqrt(1 - (s**2).sum(-1))[i], length[i] * width
+        phase, weight = 2 * np.pi * self.spectrum.height_range * self.height_scale, np.ones(1)
+        if grazing:
+            highest = np.sqrt(2 * (MAX_GRAZING + MAX_SIGMAS) * width / (index * length.min()))
+            points = int(min(MIN_POINTS + phase * highest / 4, MAX_POINTS))
+            tangent = s[i] + length[i, None] * (branch or 1) * self.q[j]
+            mean_cos_i, cos_exit, cos_o, weight = _over_grazing_lobe(s[i], tangent, sigma, index, points)
+        else:
+            mean_cos_i, cos_exit = mean_cosine(cos_i**2, sigma), mean_cosine(square, sigma / index)
+            cos_o = cos_exit
+            if phase * width > MAX_LOBE_PHASE:
+                cos_exit, cos_o, weight = _over_lobe(square, sigma / index)
+        if (count := len(weight) // len(i)) > 1:
+            i, j, cos_i = (np.tile(x, count) for x in (i, j, cos_i))
+            mean_cos_i = np.resize(mean_cos_i, len(i))
+        length = length[i]
+        value, cosine = self._factor(mean_cos_i, cos_o, length, length**2 * (self.q**2).sum(-1)[j], branch)
         # Reflected light uses κ of the two directions; transmitted light uses κ of the order's exact direction.
         kappa = self._kappa(mean_cos_i if branch else cos_i, cos_o if branch else cos_exit, length, branch)
-        return [_Terms(i, j, weight * value, cosine, kappa)]
+        return _Terms(i, j, weight * value, cosine, kappa)
 
     def _bin_terms(self, cos_i: Real, length: Real, bins: Indices, rho: Real, branch: int) -> list[_Terms]:
         """Compute the `_terms` of directions (n,) and `bins` (m,), whose centres have sin θ_o = ρ, (n, m).
@@ -441,6 +473,54 @@ def _over_lobe(square: Real, sigma: Real) -> tuple[Real, Real, Real]:
     weight = weights[:, None] * root * np.exp(-(((root**2 - x) / spread) ** 2) / 2) * horizon_gain(root**2)
     scale = np.sqrt(2 * sigma)
     return (scale * root).ravel(), (scale * np.sqrt((x + root**2) / 2)).ravel(), (weight / weight.sum(0)).ravel()
+
+
+def _over_grazing_lobe(s: Real, tangent: Real, sigma: Real, index: float, count: int) -> tuple[Real, Real, Real, Real]:
+    """Return points in lobes of orders near the horizon, of ω near the horizon.
+
+    The lobe has cos² θ_o = 2σy_o, and diffracts ω_o back into a direction of cos² θ = 2σy_i, with
+
+        y_o = x_o + n_o sin θ_o,    y_i = x_i + n_i sin θ_i
+
+    and standard normal n_i and n_o of correlation −k_i,∥·k_o,∥/|k_i,∥||k_o,∥|: where light returns to where it came
+    from, one cosine grows as the other falls, and K G is large. Points are at `count` √y_o, each with `ACROSS` n_i.
+
+    Args:
+        s, tangent: ω_∥ and −k_o,∥ of the centre, in units of n_i, (n, 2).
+        sigma: λσ_q, (n,).
+        index: n_o/n_i.
+        count: number of points in √y_o.
+
+    Returns:
+        cos θ of ω in K G, cos θ_o, cos θ_o in K G, and Γ times the density: (ACROSS · count · n,) each.
+    """
+    from scipy.special import ndtr
+
+    sin_i, k_o = (np.maximum(np.hypot(*x.T), 1e-6) for x in (s, tangent))
+    correlation, sin_o = (s * tangent).sum(-1) / (sin_i * k_o), k_o / index
+    x_i, x_o = (1 - sin_i**2) / (2 * sigma), index * (1 - sin_o**2) / (2 * sigma)
+    across = np.maximum(sin_i * np.sqrt(np.maximum(1 - correlation**2, 0)), 1e-9)
+    # Where y_o > 0, and y_i > 0 for some n_i.
+    bound = (x_i + MAX_SIGMAS * across) / np.maximum(sin_i * np.abs(correlation), 1e-6)
+    high = np.minimum(MAX_SIGMAS, np.where(correlation < 0, bound, np.inf))
+    low = np.maximum(np.maximum(-x_o / sin_o, -MAX_SIGMAS), np.where(correlation > 0, -bound, -np.inf))
+    first, last = (np.sqrt(np.maximum(x_o + sin_o * n, 0)) for n in (np.minimum(low, high), high))
+    nodes, weights = (x[:, None] for x in leggauss(count))
+    root = first + (last - first) * ((1 + nodes) / 2)
+    n_o = (root**2 - x_o) / sin_o
+    weight = weights * (last - first) * root / sin_o * np.exp(-(n_o**2) / 2) / np.sqrt(2 * np.pi)
+    mean = x_i + sin_i * correlation * n_o
+    low = np.clip(-mean / across, -MAX_ACROSS, MAX_ACROSS)
+    nodes, weights = (x[:, None, None] for x in leggauss(ACROSS))
+    n_i = low + (MAX_ACROSS - low) * ((1 + nodes) / 2)
+    density = weights * np.exp(-(n_i**2) / 2)
+    above = (ndtr(MAX_ACROSS) - ndtr(low)) / (ndtr(MAX_ACROSS) - ndtr(-MAX_ACROSS))
+    y_i, y_o = np.maximum(mean + across * n_i, 0), np.broadcast_to(root**2, n_i.shape)
+    weight = weight * above * density / density.sum(0)
+    weight *= horizon_gain(np.minimum(x_i, x_o)) * horizon_gain(np.minimum(y_i, y_o))
+    squares = sigma * (x_i + y_i), 2 * sigma / index * y_o, sigma / index * (x_o + y_o)
+    cos_i, cos_exit, cos_o = (np.sqrt(square).ravel() for square in squares)
+    return cos_i, cos_exit, cos_o, weight.ravel()
 
 
 def _above_horizon(rho: Real, sigma: Real, count: int) -> tuple[Real, Real, Real]:

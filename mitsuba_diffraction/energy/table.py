@@ -7,8 +7,8 @@ multiplied by
 
 which is reciprocal, and one where a ≤ 1 for both directions. The table holds e at nodes and is linear between them.
 Where e is smaller at the centre of a grid cell than the mean of its corners, the corners are lowered by the difference.
-This is needed because a varies fast where an order is just above the horizon, and in deep reliefs. E is a safeguard of
-the model; docs/materials.md has measured albedos.
+This is needed because a varies fast where an order is just above the horizon, and in deep reliefs, where they are
+lowered by more near the horizon. E is a safeguard of the model; docs/materials.md has measured albedos.
 
 For a line grating of period T, with c = √(1 − ω_y²) and
 
@@ -18,8 +18,8 @@ the order m > 0 propagates if m < u, and the order m < 0 if −m < v. e jumps wh
 continuous between. Each unit square of (u, v) is therefore divided into grid cells separately. They are finest near its
 lower edges, where an order is just above the horizon; at u = 0 and v = 0, ω itself is at the horizon. With f the
 fractional part of u, nodes are equidistant in √f, which is proportional to cos θ_o of that order. Where no lobe meets
-the horizon, a depends on u and v alone; where one does, its width in units of c is proportional to 1/c. The table has
-one slice.
+the horizon, a depends on u and v alone; where one does, its width in units of c is proportional to 1/c, and the table,
+which has one slice, holds the e of the maximum c, of deep reliefs the minimum of that and of the e of the minimum c.
 
 For surfaces with orders in two dimensions, for samples and for interfaces the hemisphere is mapped to a square, with
 the normal at its centre and the horizon at its edge,
@@ -54,7 +54,7 @@ from ..machine import usable_cores
 from ..optics.film_stack import MAX_PHASE_STEP, Stack
 from ..spectrum.grids import OrderGrid
 from ..spectrum.power_spectrum import PowerSpectrum
-from .furnace import MAX_E, Furnace, Real
+from .furnace import MAX_E, MAX_GRAZING, Furnace, Real
 
 MAX_LINE_NODES = 1.2e5  # nodes of the table of a line grating, about
 MAX_NODES = 100000  # nodes of any other table
@@ -62,6 +62,7 @@ MAX_NODE_COMPONENT_PAIRS = 3e7  # evaluations for a table with one ratio
 SLICES, MAX_SLICES = 16, 96  # nodes of 1/λ; more than the minimum where fringes of films are narrow
 MIN_FRACTION = 1e-7  # distance of nodes from whole u and v
 MIN_T = 0.01  # t of nodes at the horizon
+MAX_GRAZING_COS = 0.2  # cos θ of ω, below which grid cells do not resolve the orders that return to ω
 MAX_KEPT = 16  # tables of this process that are kept; at most 6.4 MB each, mostly 0.4 MB
 
 
@@ -239,17 +240,23 @@ class EnergyTable:
         of_nodes = _bounds(layout, sides, ratios, layout.points(0.0), laterals)
         of_centres = _bounds(layout, sides, ratios, layout.points(0.5), laterals)
         # e varies fast where an order is just above the horizon, and in deep reliefs. Where it is less at the centre of
-        # a grid cell than between the corners, the corners are lowered by the difference.
+        # a grid cell than between the corners, the corners are lowered by the difference. Reliefs deeper than light is
+        # long return light to where it came from at grazing incidence, where K G is large and the cells do not resolve
+        # its lobes: there the corners are lowered by twice the difference, of either sign.
+        omega, _ = layout.directions(layout.points(0.5), layout.frequencies[0])
+        unresolved_cells = (omega[:, 2] < MAX_GRAZING_COS) & _is_deep(above, layout)
         corners = layout.corners()
         values = np.empty((*of_nodes.shape[:2], *layout.shape), np.uint8)
         for channel in np.ndindex(of_nodes.shape[:2]):
             e = of_nodes[channel].reshape(layout.shape)
-            between = np.mean([e[corner] for corner in corners], axis=0)
-            centre = of_centres[channel].reshape(between.shape)
-            excess = np.maximum(np.where(centre < 1, between - centre, 0), 0)
+            of_corners = np.array([e[corner] for corner in corners])
+            centre = of_centres[channel].reshape(of_corners.shape[1:])
+            excess, lowest = of_corners.mean(axis=0) - centre, np.minimum(of_corners.min(axis=0), centre)
+            unresolved = unresolved_cells.reshape(centre.shape) & (lowest < 1)
+            excess = np.where(unresolved, 2 * np.abs(excess), np.where(centre < 1, np.maximum(excess, 0), 0))
             lowered = e.copy()
             for corner in corners:
-                lowered[corner] = np.minimum(lowered[corner], e[corner] - excess)
+                lowered[corner] = np.minimum(lowered[corner], np.maximum(e[corner] - excess, lowest / 2))
             values[channel] = np.rint(np.clip(lowered, 0, MAX_E) * (255 / MAX_E))
         return cls(layout, values, tuple(ratios))
 
@@ -297,6 +304,11 @@ _keeping = threading.Lock()
 _kept: dict[Hashable, EnergyTable] = {}
 
 
+def _is_deep(furnace: Furnace, layout: Layout) -> bool:
+    """Return whether the relief is deeper than the longest wavelength."""
+    return furnace.spectrum.height_range * furnace.height_scale * layout.frequencies[0] > 1
+
+
 def _bounds(
     layout: Layout, sides: Sequence[Furnace], ratios: Sequence[float], points: Real, laterals: tuple[float, float]
 ) -> Real:
@@ -310,8 +322,16 @@ def _bounds(
         _, row, column = points.T
         mirror = 1 if grid.shape[0] == 1 else -1
         used = row <= column if mirror == 1 else row + column <= layout.side
-    omega, wavelengths = layout.directions(points[used], float(np.mean(layout.frequencies)))
-    e = np.ones((len(ratios), sum(len(side.branches[:2]) for side in sides), len(points)))
+    omega, wavelengths = layout.directions(points[used], layout.frequencies[0])
+    node = np.flatnonzero(used)
+    if layout.lines and _is_deep(sides[0], layout):
+        # Of the directions with the same u and v also the one farthest from the plane, where lobes meet the horizon.
+        grazing = omega[:, 2] ** 2 < 2 * MAX_GRAZING * sides[0].lobe_scale * sides[0].spectrum.lobe_width * wavelengths
+        conical = layout.directions(points[node[grazing]], layout.frequencies[1])
+        omega, wavelengths = (np.concatenate(x) for x in zip((omega, wavelengths), conical, strict=True))
+        node = np.concatenate([node, node[grazing]])
+    e = np.full((len(ratios), sum(len(side.branches[:2]) for side in sides), len(points)), MAX_E)
+    found = np.empty((*e.shape[:2], len(node)))
     if layout.lines:
         slices = np.array_split(np.arange(len(omega)), SLICES)
     else:
@@ -329,7 +349,9 @@ def _bounds(
 
     with ThreadPoolExecutor(usable_cores()) as pool:
         for slice_, bounds in zip(slices, pool.map(of_slice, slices), strict=True):
-            e[..., np.flatnonzero(used)[slice_]] = bounds
+            found[..., slice_] = bounds
+    for of_node, of_direction in zip(e.reshape(-1, len(points)), found.reshape(-1, len(node)), strict=True):
+        np.minimum.at(of_node, node, of_direction)
     if mirror:
         count = len(np.unique(points[:, 1]))
         mirrored = e.reshape(*e.shape[:2], -1, count, count)[..., ::mirror, ::mirror].swapaxes(-1, -2)

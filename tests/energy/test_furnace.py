@@ -8,7 +8,8 @@ import pytest
 from scipy.special import jv
 
 import mitsuba_diffraction as md
-from mitsuba_diffraction.energy.furnace import Furnace, bounds_of, mean_cosine
+from mitsuba_diffraction.energy.furnace import MAX_E, Furnace, bounds_of, mean_cosine
+from mitsuba_diffraction.energy.table import EnergyTable
 from mitsuba_diffraction.optics.film_stack import Stack
 from mitsuba_diffraction.optics.geometry import horizon_gain, k_g
 from mitsuba_diffraction.optics.refractive_indices import constant
@@ -109,6 +110,24 @@ def test_transmission_of_a_deep_film_agrees_with_the_closed_form(theta):
     assert bounds_of(albedo, NORMAL)[1] > 0.98
 
 
+def bounds_of_table(table, omega, wavelengths):
+    """e of a table of lines along y, from its module's docstring; λ in µm."""
+    layout, c = table.layout, np.hypot(omega[:, 0], omega[:, 2])
+    e = table.values[0, 0, 0] * (MAX_E / 255)
+    cells = []
+    for along in (c - omega[:, 0], c + omega[:, 0]):
+        u = along * layout.period / wavelengths
+        square = np.minimum(u.astype(int), layout.squares - 1)
+        count = np.where(square > 0, layout.cells, layout.first)
+        x = np.sqrt(np.clip(u - square, 0, 1)) * count
+        cell = np.minimum(x.astype(int), count - 1)
+        first = np.where(square > 0, layout.first + 1 + (square - 1) * (layout.cells + 1), 0)
+        cells.append((first + cell, x - cell))
+    (column, x), (row, y) = cells
+    low, high = (e[at, column] + x * (e[at, column + 1] - e[at, column]) for at in (row, row + 1))
+    return np.minimum(low + y * (high - low), 1)
+
+
 def order_albedo(of, omega, wavelength, steps=161):
     """∫ K G S W dq of orders that are evaluated one by one, each over a square lattice about it; λ in µm."""
     q_x, q_y = (q.ravel() for q in np.meshgrid(*of.grid.frequencies()))
@@ -145,6 +164,32 @@ def test_the_furnace_is_the_integral_over_the_lobes_of_orders(depth, coherence_l
     omega, wavelengths = oblique(rng, 8, 89), rng.uniform(0.36, 0.83, 8)
     wanted = [order_albedo(of, *at) for at in zip(omega, wavelengths, strict=True)]
     np.testing.assert_allclose(Furnace.of(of).albedo(omega, wavelengths)[0], wanted, rtol=0.02)
+
+
+def test_deep_lines_return_no_more_light_than_they_receive_at_grazing_incidence():
+    """Regression: 1.26 to 1.5.
+
+    Where light returns to where it came from, one cosine grows as the other falls within a lobe; and the table held e
+    of one angle to the plane of incidence.
+    """
+    rng = np.random.default_rng(6)
+    of = md.precompute(md.HeightField(1.6 * rng.random((1, 18)), 0.0425), coherence_length=6.2, tolerance=1e-2)
+    theta, phi = np.deg2rad(rng.uniform(85, 89.9, 60)), np.deg2rad(rng.uniform(*np.array([[-5, 0], [5, 360]]), (30, 2)))
+    omega = np.stack([np.sin(theta) * np.cos(phi.T.ravel()), np.sin(theta) * np.sin(phi.T.ravel()), np.cos(theta)], -1)
+    wavelengths = rng.uniform(0.36, 0.83, 60)
+    albedo = np.array([order_albedo(of, *at, steps=81) for at in zip(omega, wavelengths, strict=True)])
+    assert albedo.max() > 2
+    assert (np.abs(Furnace.of(of).albedo(omega, wavelengths)[0] - albedo) / np.maximum(albedo, 1)).mean() < 0.03
+    assert (albedo * bounds_of_table(EnergyTable.of(of), omega, wavelengths)).max() < 1.05
+
+
+def test_each_order_is_one_term_of_the_albedo():
+    """Regression: where the phase varies within a lobe, the sampler of orders had one of nine points of each."""
+    furnace, rng = Furnace.of(md.precompute(md.gratings.blazed(2.5, 3.0))), np.random.default_rng(6)
+    omega, wavelengths = oblique(rng, 10, 89), rng.uniform(0.36, 0.83, 10)
+    direction, order, power = furnace.terms(omega, wavelengths, 0)
+    assert len(set(zip(direction, order, strict=True))) == len(direction) > 50
+    np.testing.assert_allclose(np.bincount(direction, power), furnace.albedo(omega, wavelengths)[0], rtol=1e-6)
 
 
 def test_the_mean_cosine_of_a_lobe_far_from_the_horizon_is_that_of_its_centre():
