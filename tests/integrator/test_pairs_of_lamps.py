@@ -137,6 +137,12 @@ def test_an_area_lamp_keeps_its_light_beside_lamps_without_extent(weight, radius
     assert_bins_agree(scene(blaze(2.0), lamps), count=2**17)
 
 
+def test_a_sky_beside_a_bulb_is_weighted_by_the_probability_that_it_is_drawn():
+    """On lobes so wide that the BSDF and the sky find each other's directions."""
+    lamps = {"sky": {"type": "constant", "radiance": uniform(0.5)}, "bulb": LAMPS["bulb"](AT[1])}
+    assert_bins_agree(scene(blaze(1.0), lamps), count=2**18)
+
+
 @pytest.mark.slow
 @pytest.mark.parametrize(
     ("hidden", "other", "occluder"),
