@@ -11,8 +11,8 @@ with the gain Γ of lobes at the horizon. a is summed over components of S, each
 
       cos θ → √(2λσ_q) m(x),    m(x) = ∫₀^∞ g(x) g(y) φ(x − y) √((x + y)/2) dy,    x = cos² θ/(2λσ_q)
 
-  with the `horizon_gain` g; m(x) → √x away from the horizon. Where ω is near the horizon, too, both cosines vary
-  together within the lobe, over which K G Γ η_m is integrated.
+  with the `horizon_gain` g; m(x) → √x away from the horizon. Where ω is near the horizon, too, and the
+  relief is deeper than λ, both cosines vary together within the lobe, over which K G Γ η_m is integrated.
 - Where orders overlap, and for a sample, a bin of the frequency plane, in which S is accumulated. The part of its
   radial extent that is above the horizon determines its weight and its cosine. Near the mirror direction at grazing
   incidence (1 − b) K G + b Γ replaces K G, as in `Geometry.continuum_factor` of `bsdf/directions.py`.
@@ -265,7 +265,9 @@ class Furnace:
         i, j = np.nonzero(square > 0)
         square, j = square[i, j], near[j]
         sigma = length[i] * (self.lobe_scale * self.spectrum.lobe_width)
-        grazing = np.maximum(cos_i[i] ** 2, index * square) < 2 * MAX_GRAZING * sigma
+        # In shallow reliefs the mean of each cosine suffices: K G is large where κ, and with it η, is small.
+        grazing = self.spectrum.height_range * self.height_scale > length[i]
+        grazing &= np.maximum(cos_i[i] ** 2, index * square) < 2 * MAX_GRAZING * sigma
         parts = [(part, both) for part, both in ((~grazing, False), (grazing, True)) if part.any()]
         return [self._order_terms(s, length, i[part], j[part], square[part], branch, both) for part, both in parts]
 

@@ -18,8 +18,9 @@ the order m > 0 propagates if m < u, and the order m < 0 if −m < v. e jumps wh
 continuous between. Each unit square of (u, v) is therefore divided into grid cells separately. They are finest near its
 lower edges, where an order is just above the horizon; at u = 0 and v = 0, ω itself is at the horizon. With f the
 fractional part of u, nodes are equidistant in √f, which is proportional to cos θ_o of that order. Where no lobe meets
-the horizon, a depends on u and v alone; where one does, its width in units of c is proportional to 1/c, and the table,
-which has one slice, holds the e of the maximum c, of deep reliefs the minimum of that and of the e of the minimum c.
+the horizon, a depends on u and v alone; where one does, its width in units of c is proportional to 1/c. The table has
+one slice, of a mean c; of reliefs deeper than the longest wavelength, it holds the minimum of e at the largest and at
+the smallest c.
 
 For surfaces with orders in two dimensions, for samples and for interfaces the hemisphere is mapped to a square, with
 the normal at its centre and the horizon at its edge,
@@ -322,10 +323,13 @@ def _bounds(
         _, row, column = points.T
         mirror = 1 if grid.shape[0] == 1 else -1
         used = row <= column if mirror == 1 else row + column <= layout.side
-    omega, wavelengths = layout.directions(points[used], layout.frequencies[0])
+    # Of deep lines, first of the directions with the same u and v that in the plane.
+    of_both = layout.lines and _is_deep(sides[0], layout)
+    frequency = layout.frequencies[0] if of_both else float(np.mean(layout.frequencies))
+    omega, wavelengths = layout.directions(points[used], frequency)
     node = np.flatnonzero(used)
-    if layout.lines and _is_deep(sides[0], layout):
-        # Of the directions with the same u and v also the one farthest from the plane, where lobes meet the horizon.
+    if of_both:
+        # Also the one farthest from the plane, where lobes meet the horizon.
         grazing = omega[:, 2] ** 2 < 2 * MAX_GRAZING * sides[0].lobe_scale * sides[0].spectrum.lobe_width * wavelengths
         conical = layout.directions(points[node[grazing]], layout.frequencies[1])
         omega, wavelengths = (np.concatenate(x) for x in zip((omega, wavelengths), conical, strict=True))

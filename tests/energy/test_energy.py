@@ -238,15 +238,15 @@ def test_the_derivative_by_height_includes_that_of_the_energy_factor():
 
 
 def test_the_derivative_by_lengths_includes_that_of_the_energy_factor():
-    """In the mean over wavelengths and directions, since e jumps where an order appears."""
+    """In the mean over wavelengths, since e jumps where an order appears."""
     of = md.precompute(md.gratings.sinusoidal(2.0, 0.25), coherence_length=16.0)
-    bsdf, scale, wavelengths, differences = plugin(of), mi.Float(0.97), np.linspace(0.4, 0.7, 1000), []
+    bsdf, scale, wavelengths = plugin(of), mi.Float(0.97), np.linspace(0.4, 0.7, 1000)
     dr.enable_grad(scale)
     parameters = mi.traverse(bsdf)
     parameters["lateral_scale"] = scale
     parameters.update()
     energy = bsdf.layers.grating.theory.energy
-    for theta in np.deg2rad(np.arange(0, 80, 5)):
+    for theta in np.deg2rad([0, 15, 30, 45, 60, 75]):
         omega = np.tile([np.sin(theta), 0, np.cos(theta)], (len(wavelengths), 1))
 
         def exact(s, omega=omega):
@@ -255,11 +255,7 @@ def test_the_derivative_by_lengths_includes_that_of_the_energy_factor():
         wanted = np.mean(exact(0.98) - exact(0.96)) / 0.02
         e = energy.bound(energy.coordinates(vectors(omega)), scale / floats(wavelengths), ratio=1 / scale)
         dr.forward(scale)
-        differences.append((np.mean(array(dr.grad(e), np.float64)) - wanted, wanted))
-    difference, wanted = np.transpose(differences)
-    assert np.abs(difference.mean()) < 2e-3
-    assert np.abs(difference).max() < 0.012
-    assert np.abs(wanted).max() > 0.2
+        assert np.mean(array(dr.grad(e), np.float64)) == pytest.approx(wanted, abs=5e-3)
 
 
 def test_e_of_textured_heights_is_that_of_each_uniform_height():
