@@ -63,7 +63,7 @@ def alone(name="blazed", coherence_length=3.0):
 pytestmark = pytest.mark.usefixtures("llvm")
 
 
-@pytest.mark.few(2)
+@pytest.mark.slow
 @pytest.mark.parametrize("name", sorted(SMOOTH))
 def test_value_is_the_sum_of_the_grating_and_the_transmitted_base(name):
     rng = np.random.default_rng(3)

@@ -67,7 +67,7 @@ def case(request):
 SPECIAL = [0.0, -0.0, 359.9, 830.1, 1000.0, -500.0, 1e-45, 1e30, np.inf, -np.inf, np.nan]  # in a coat 1000/1.5 nm
 
 
-@pytest.mark.few(2)
+@pytest.mark.few(1)
 def test_wavelengths_outside_the_spectrum_are_black_and_change_no_others(case):
     variant, name, bsdf, (wi, wo, u) = case
     mi.set_variant(variant)

@@ -274,7 +274,7 @@ def test_samples_pass_the_chi_square_test(llvm, mode, side):
     check_chi_square(bsdf, direction(30, 20) * [1, 1, side], ctx=ctx, cases=4, side=side)
 
 
-@pytest.mark.few(1)
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("film", "parameters"),
     [

@@ -581,6 +581,7 @@ def test_a_relief_without_height_is_a_plane(kind, relief):
         np.testing.assert_allclose((r, t), wanted, atol=0.015)
 
 
+@pytest.mark.few(1)
 @pytest.mark.parametrize(
     ("wi", "wavelength", "relief"),
     [

@@ -199,7 +199,7 @@ def assert_sum_over_lamps(built, count=2**17, limit=0.02, depth=2):
     return error
 
 
-@pytest.mark.few(2)
+@pytest.mark.few(1)
 @pytest.mark.parametrize("name", SURFACES)
 def test_light_of_lamps_is_the_sum_over_their_points(name, llvm):
     assert_sum_over_lamps(scene(SURFACES[name](), **two_lamps(-1 if name == "sheet" else 1)))
@@ -219,6 +219,7 @@ def test_later_vertices_have_the_limit_of_path(llvm):
     np.testing.assert_array_less(np.abs(found - wanted), 4 * np.hypot(error, its_error))
 
 
+@pytest.mark.slow
 def test_instances_draw_candidates(llvm):
     """A plate of a group, which an instance moves to the origin, beside a group without gratings."""
     groups = {"plate": surface(), "paint": {"type": "diffuse"}}

@@ -519,6 +519,7 @@ SCENE = """<scene version="3.0.0">
 </scene>"""
 
 
+@pytest.mark.slow
 def test_any_number_of_light_paths_has_the_same_kernel_of_a_body_recorded_once(llvm, tmp_path, monkeypatch):
     (tmp_path / "scene.xml").write_text(SCENE)
     built = SceneFile(tmp_path / "scene.xml").load()

@@ -133,7 +133,7 @@ def sums_over_wavelengths(built, number=9400):
     return total
 
 
-@pytest.mark.few(2)
+@pytest.mark.few(1)
 @pytest.mark.parametrize("surface", SURFACES)
 @pytest.mark.parametrize("lamps", LAMPS)
 def test_light_of_lamps_is_the_sum_over_wavelengths(lamps, surface, llvm):
@@ -182,7 +182,7 @@ def test_instances_have_wavelengths_of_their_own(llvm):
     np.testing.assert_array_less(np.abs(found - wanted), 4 * np.hypot(error, its_error))
 
 
-@pytest.mark.few(1)
+@pytest.mark.slow
 @pytest.mark.parametrize("surface", ["wide", "blend"])
 @pytest.mark.parametrize("lights", [with_sky, with_lamp_and_sky])
 def test_other_lights_are_drawn_beside_the_lamps(lights, surface, llvm):
@@ -244,6 +244,7 @@ FILMS = {
 }
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("film", "sensor"),
     [

@@ -15,6 +15,7 @@ def hue(XYZ):
     return np.rad2deg(np.arctan2(b, a))
 
 
+@pytest.mark.slow
 def test_a_line_grating_shows_rings_of_its_colours(llvm):
     import mitsuba as mi
 
