@@ -25,8 +25,8 @@ function firstView(data) {
       lightWidth: 0.5, lightLength: 0, sky: 0, hasBase: false, pigment: "#141a22" };
   }
   if (shapeOf(data) === "disc") {
-    return { azimuth: -90, elevation: 45, distance: 4.6, lightAzimuth: 74, lightElevation: 50,
-      lightWidth: 2, lightLength: 0, sky: 0.05, hasBase: isDielectric, pigment: "#141a22" };
+    return { azimuth: -90, elevation: 45, distance: 4.6, lightAzimuth: 98, lightElevation: 26,
+      lightWidth: 5, lightLength: 0, sky: 0.15, hasBase: isDielectric, pigment: "#141a22" };
   }
   const lines = data.spectrum.max_order.includes(0);
   return { azimuth: -90, elevation: 20, distance: 5.2, lightAzimuth: -75, lightElevation: 35,
