@@ -29,7 +29,7 @@ PACKAGE = Path(md.__file__).parent
 PAGES = [ROOT / "README.md", *sorted((ROOT / "docs").glob("*.md"))]
 SLOW = {
     *("compare", "derivatives", "design", "export", "index", "long_renders", "materials", "own_grating", "own_scan"),
-    *("plugin", "python", "viewer"),
+    *("plugin", "published", "python", "viewer"),
 }
 """Pages whose code takes long."""
 WAY_IN = ("index", "gallery", "blender", "viewer", "own_scan", "own_grating", "design", "plugin", "python")

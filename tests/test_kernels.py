@@ -219,7 +219,7 @@ LEFT_OUT = {
 }
 
 
-@pytest.mark.few(2)
+@pytest.mark.few(1)
 @pytest.mark.parametrize("name", LEFT_OUT)
 def test_gratings_that_are_not_recorded_change_no_pixel(name, monkeypatch):
     """Where they are evaluated as black, their values are not used."""
