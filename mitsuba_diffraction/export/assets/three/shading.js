@@ -335,12 +335,16 @@ export function drawnOfTable(sums, size, stretch, count) {
   const edge = Math.asinh(MAX_U / stretch), x = (k) => edge * ((2 * k) / (size - 1) - 1);
   const node = (k) => stretch * Math.sinh(x(k)), width = (k) => (stretch * Math.cosh(x(k)) * edge * 2) / (size - 1);
   const at = (k) => [k % size, Math.floor(k / size)];
-  const weights = Float64Array.from(sums, (sum, k) => {
+  // Along a Z-order curve, equal steps of the sum are compact regions.
+  const spread = (i) => Array.from({ length: 8 }, (_, bit) => ((i >> bit) & 1) * 4 ** bit).reduce((a, b) => a + b, 0);
+  const codes = Array.from(sums, (_, k) => spread(at(k)[0]) + 2 * spread(at(k)[1]));
+  const order = [...codes.keys()].sort((a, b) => codes[a] - codes[b]);
+  const weights = Float64Array.from(order, (k) => {
     const [i, j] = at(k);
-    return node(i) ** 2 + node(j) ** 2 > MAX_U ** 2 ? 0 : sum * width(i) * width(j);
+    return node(i) ** 2 + node(j) ** 2 > MAX_U ** 2 ? 0 : sums[k] * width(i) * width(j);
   });
   return drawn(weights, (k, part) => {
-    const [i, j] = at(k);
+    const [i, j] = at(order[k]);
     return [node(i), node(j), part / (width(i) * width(j)), 0];
   }, count);
 }
