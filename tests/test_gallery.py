@@ -101,6 +101,7 @@ def test_pictures_are_compressed_in_true_colour(tmp_path):
         assert np.abs(np.asarray(picture, float) - smooth).mean() < 8
 
 
+@pytest.mark.slow
 def test_a_palette_and_too_much_noise_are_refused(tmp_path):
     path = tmp_path / "noise.png"
     noise = Image.fromarray(np.random.default_rng(0).integers(0, 256, (900, 900, 3), np.uint8))

@@ -152,6 +152,7 @@ def test_a_bug_keeps_its_traceback(monkeypatch, llvm):
         mi.load_dict({"type": "diffraction_grating", "profile": "blazed", "period": 2.5, "depth": 0.25})
 
 
+@pytest.mark.slow
 def test_the_log_is_plain_text(caplog, capfd, llvm, command, monkeypatch, tmp_path):
     """One line each, without colours and places in the code; Mitsuba's own log has both, in files too."""
     monkeypatch.setattr(progress, "MIN_REPORTED_SECONDS", 1e6)  # a slow machine says how far it is

@@ -20,6 +20,7 @@ from mitsuba_diffraction.settings import ScalarSettings
 RUBBED = {"profile": "xenopeltis_synthetic", "size": 5.0, "patches": 3}
 
 
+@pytest.mark.slow
 def test_a_log_reports_in_one_line_that_a_spectrum_is_computed(llvm, capfd, monkeypatch):
     """From Python a skin took half a minute without a word."""
     monkeypatch.setattr(progress, "log_lines", functools.partial(progress.log_lines, first=0, seconds=math.inf))

@@ -329,6 +329,7 @@ def test_stripes_of_the_beetle_reflect_at_700_nm_and_the_rest_at_530_nm():
 # ---------------------------------------------------------------- the snake
 
 
+@pytest.mark.slow
 def test_snake_lies_on_the_ground_and_not_in_itself():
     nodes = snake.centre_line()
     s = np.linspace(0, snake.LENGTH, len(nodes))

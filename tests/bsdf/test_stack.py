@@ -337,7 +337,7 @@ def test_a_medium_with_dispersion_is_a_constant_one_at_each_wavelength(llvm, tra
         assert wanted.max() > 0.01
 
 
-@pytest.mark.few(1)
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "parameters",
     [

@@ -130,6 +130,7 @@ def test_inputs_are_not_overwritten(command, line, name):
     assert "is read" in refused(command, f"{line} --overwrite", name)
 
 
+@pytest.mark.slow
 def test_default_names_differ_from_inputs(command):
     before = contents()
     line = RENDER.replace("u.xml", "u.xml -D spectrum=u.exr")

@@ -306,6 +306,7 @@ def random_profiles(count):
         yield md.HeightField(depth * heights[None] / np.ptp(heights), (period / 128, period))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("count", [4, pytest.param(48, marks=pytest.mark.slow)])
 def test_estimated_error_is_near_the_solved_one(count):
     factors = []

@@ -149,6 +149,7 @@ def test_the_opacity_of_a_mask_counts_once(llvm):
     assert means["path"] == pytest.approx(0.7 * means["volpath"], rel=0.01)
 
 
+@pytest.mark.few(1)
 @pytest.mark.parametrize("kind", ["ellipsoids", "ellipsoidsmesh"])
 def test_rays_meet_ellipsoids_from_outside_only(llvm, tmp_path, kind):
     """In Mitsuba 3.9.1; `diffraction_path` is then `path`, and random scenes have none."""

@@ -118,6 +118,7 @@ def assert_bins_agree(built, judge="path", count=2**19):
     return wanted
 
 
+@pytest.mark.slow
 def test_a_hidden_lamp_is_dark_beside_another():
     """Two suns, one of them hidden: the sum over wavelengths of the other."""
     other = {"other": LAMPS["sun"](ORDERS[1])}
