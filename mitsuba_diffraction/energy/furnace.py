@@ -11,8 +11,8 @@ with the gain Γ of lobes at the horizon. a is summed over components of S, each
 
       cos θ → √(2λσ_q) m(x),    m(x) = ∫₀^∞ g(x) g(y) φ(x − y) √((x + y)/2) dy,    x = cos² θ/(2λσ_q)
 
-  with the `horizon_gain` g; m(x) → √x away from the horizon. Where ω is near the horizon, too, and the
-  relief is deeper than λ, both cosines vary together within the lobe, over which K G Γ η_m is integrated.
+  with the `horizon_gain` g; m(x) → √x away from the horizon. Where ω is near the horizon, too, and the relief is
+  deeper than λ, K G Γ η_m is integrated over the lobe, in which the two cosines vary together.
 - Where orders overlap, and for a sample, a bin of the frequency plane, in which S is accumulated. The part of its
   radial extent that is above the horizon determines its weight and its cosine. Near the mirror direction at grazing
   incidence (1 − b) K G + b Γ replaces K G, as in `Geometry.continuum_factor` of `bsdf/directions.py`.
@@ -484,8 +484,8 @@ def _over_grazing_lobe(s: Real, tangent: Real, sigma: Real, index: float, count:
 
         y_o = x_o + n_o sin θ_o,    y_i = x_i + n_i sin θ_i
 
-    and standard normal n_i and n_o of correlation −k_i,∥·k_o,∥/|k_i,∥||k_o,∥|: where light returns to where it came
-    from, one cosine grows as the other falls, and K G is large. Points are at `count` √y_o, each with `ACROSS` n_i.
+    and standard normal n_i and n_o of correlation −k_i,∥·k_o,∥/|k_i,∥||k_o,∥|: in retroreflection
+    one cosine grows as the other falls, and K G is large. Points are at `count` √y_o, each with `ACROSS` n_i.
 
     Args:
         s, tangent: ω_∥ and −k_o,∥ of the centre, in units of n_i, (n, 2).

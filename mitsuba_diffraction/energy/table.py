@@ -19,8 +19,8 @@ continuous between. Each unit square of (u, v) is therefore divided into grid ce
 lower edges, where an order is just above the horizon; at u = 0 and v = 0, ω itself is at the horizon. With f the
 fractional part of u, nodes are equidistant in √f, which is proportional to cos θ_o of that order. Where no lobe meets
 the horizon, a depends on u and v alone; where one does, its width in units of c is proportional to 1/c. The table has
-one slice, of a mean c; of reliefs deeper than the longest wavelength, it holds the minimum of e at the largest and at
-the smallest c.
+one slice, of a mean c; of reliefs deeper than the longest wavelength, it holds the minimum of e at the maximum and at
+the minimum of c.
 
 For surfaces with orders in two dimensions, for samples and for interfaces the hemisphere is mapped to a square, with
 the normal at its centre and the horizon at its edge,
@@ -241,9 +241,9 @@ class EnergyTable:
         of_nodes = _bounds(layout, sides, ratios, layout.points(0.0), laterals)
         of_centres = _bounds(layout, sides, ratios, layout.points(0.5), laterals)
         # e varies fast where an order is just above the horizon, and in deep reliefs. Where it is less at the centre of
-        # a grid cell than between the corners, the corners are lowered by the difference. Reliefs deeper than light is
-        # long return light to where it came from at grazing incidence, where K G is large and the cells do not resolve
-        # its lobes: there the corners are lowered by twice the difference, of either sign.
+        # a grid cell than between the corners, the corners are lowered by the difference. Reliefs deeper than the longest
+        # wavelength retroreflect light at grazing incidence, where K G is large and grid cells do not resolve the lobes:
+        # corners of these cells are lowered by twice the difference, of either sign.
         omega, _ = layout.directions(layout.points(0.5), layout.frequencies[0])
         unresolved_cells = (omega[:, 2] < MAX_GRAZING_COS) & _is_deep(above, layout)
         corners = layout.corners()

@@ -153,8 +153,8 @@ class Renderer {
     const [width, height] = this.drawn;
     const radius = RADII[state.shape] ?? Infinity, whole = Math.hypot(width, height) / 2;
     const seen = radius < state.distance ? radius / Math.sqrt(state.distance ** 2 - radius ** 2) / camera.tangents[0] : Infinity;
-    const reach = Math.ceil(Math.min((seen * width) / 2, whole)) + 1;  // a pixel for the jitter
-    gl.viewport(Math.round(width / 2) - reach, Math.round(height / 2) - reach, 2 * reach, 2 * reach);
+    const half = Math.ceil(Math.min((seen * width) / 2, whole)) + 1;  // a pixel for the jitter
+    gl.viewport(Math.round(width / 2) - half, Math.round(height / 2) - half, 2 * half, 2 * half);
     gl.bindVertexArray(this.empty);
     gl.drawArrays(gl.TRIANGLE_FAN, 0, 16);
   }
