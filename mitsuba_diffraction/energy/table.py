@@ -241,8 +241,8 @@ class EnergyTable:
         of_nodes = _bounds(layout, sides, ratios, layout.points(0.0), laterals)
         of_centres = _bounds(layout, sides, ratios, layout.points(0.5), laterals)
         # e varies fast where an order is just above the horizon, and in deep reliefs. Where it is less at the centre of
-        # a grid cell than between the corners, the corners are lowered by the difference. Reliefs deeper than the longest
-        # wavelength retroreflect light at grazing incidence, where K G is large and grid cells do not resolve the lobes:
+        # a grid cell than between the corners, the corners are lowered by the difference. Reliefs deeper than all
+        # wavelengths retroreflect light at grazing incidence, where K G is large and grid cells do not resolve lobes:
         # corners of these cells are lowered by twice the difference, of either sign.
         omega, _ = layout.directions(layout.points(0.5), layout.frequencies[0])
         unresolved_cells = (omega[:, 2] < MAX_GRAZING_COS) & _is_deep(above, layout)
