@@ -291,8 +291,8 @@ class RigorousSpectrum:
     """
 
     axes: Axes
-    values: NDArray[np.float32]
-    mueller: NDArray[np.float32] | None
+    values: NDArray[np.float32] = field(repr=False)
+    mueller: NDArray[np.float32] | None = field(repr=False)
     settings: RigorousSettings
     error: float
     max_error: float

@@ -90,8 +90,16 @@ def test_light_that_a_table_lacks_is_refused_with_its_range(llvm):
         assert "\n" not in str(found.value)
 
 
+@pytest.fixture
+def few_steps(monkeypatch):
+    """Of tables whose values are not looked at."""
+    monkeypatch.setattr("mitsuba_diffraction.rigorous.build_table.SOLVED_STEPS", ((6, 8, 6),))
+    monkeypatch.setattr("mitsuba_diffraction.rigorous.build_table.CHECK_COUNT", 10)
+
+
 @pytest.mark.slow
-def test_a_rigorous_spectrum_is_refused_outside_its_wavelengths(llvm):
+@pytest.mark.filterwarnings("ignore:rigorous table")
+def test_a_rigorous_spectrum_is_refused_outside_its_wavelengths(llvm, few_steps):
     settings = {"theory": "rigorous", "int_ior": 1.5, "tolerance": 0.2, "coherence_length": 40.0}
     of = md.precompute(md.gratings.sinusoidal(1.0, 0.1), wavelengths=(500, 600), **settings)
     bsdf = {"type": "diffraction_grating", "spectrum": of}
@@ -101,19 +109,15 @@ def test_a_rigorous_spectrum_is_refused_outside_its_wavelengths(llvm):
 
 
 @pytest.mark.slow
-def test_below_a_coat_a_rigorous_spectrum_is_refused_with_the_wavelengths_that_it_needs(llvm):
+@pytest.mark.filterwarnings("ignore:rigorous table")
+def test_below_a_coat_a_rigorous_spectrum_is_refused_with_the_wavelengths_that_it_needs(llvm, few_steps):
     # Regression: light of 360 to 830 nm was refused with "build it for wavelengths=(360, 830)", those of the spectrum.
     settings = {"theory": "rigorous", "material": "Al", "ext_ior": 1.5, "tolerance": 0.2, "coherence_length": 40.0}
-
-    def bsdf(wavelengths):
-        of = md.precompute(md.gratings.sinusoidal(0.7, 0.1), wavelengths=wavelengths, **settings)
-        return {"type": "diffraction_grating", "spectrum": of, "material": "Al", "coat_ior": 1.5}
-
+    of = md.precompute(md.gratings.sinusoidal(0.7, 0.1), wavelengths=(300, 590), **settings)
     with pytest.raises(RuntimeError, match=r"those inside of the index 1\.4") as refused:
-        mi.load_dict(scene(bsdf((300, 590))))
+        mi.load_dict(scene({"type": "diffraction_grating", "spectrum": of, "material": "Al", "coat_ior": 1.5}))
     first, last = map(float, re.search(r"=\((.*), (.*)\)", str(refused.value)).groups())
     assert (first, last) == pytest.approx((360 / 1.5, 830 / 1.5), rel=1e-3)
-    mi.load_dict(scene(bsdf((first, last))))
 
 
 def test_wavelengths_without_light_need_no_table(llvm):
@@ -183,7 +187,7 @@ def test_a_refused_sensor_leaves_the_scene_as_it_was(llvm):
 @pytest.mark.slow
 def test_a_spectrum_for_ultraviolet_has_the_current_index(llvm):
     # Regression: the tables were made for the index of the scene at loading.
-    glass = {**GRATING, "transmission": "interface", "int_ior": 1.5}
+    glass = {**GRATING, "depth": 0.1, "transmission": "interface", "int_ior": 1.5}
     loaded, fresh = (mi.load_dict(scene({**glass, "int_ior": n})) for n in (1.5, 1.2))
     parameters = mi.traverse(loaded)
     parameters["grating.bsdf.eta"] = parameters["grating.bsdf.eta"] * (1.2 / 1.5)
@@ -191,8 +195,8 @@ def test_a_spectrum_for_ultraviolet_has_the_current_index(llvm):
     sensor = mi.load_dict(scene(glass, (250, 300))["sensor"])
     for one in (loaded, fresh):
         mi.render(one, sensor=sensor, spp=1)
-    found, wanted = (albedo(one.shapes()[0].bsdf(), direction(60, 20) * [1, 1, -1]) for one in (loaded, fresh))
-    np.testing.assert_allclose(found, wanted, rtol=0.05)
+    found, wanted = (albedo(one.shapes()[0].bsdf(), direction(45, 20) * [1, 1, -1]) for one in (loaded, fresh))
+    np.testing.assert_allclose(found, wanted, rtol=0.02)
 
 
 def test_visible_light_outside_a_saved_spectrum_is_refused_once_it_is_there(llvm):

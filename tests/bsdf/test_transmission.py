@@ -590,7 +590,6 @@ def test_a_relief_without_height_is_a_plane(kind, relief):
         *(
             pytest.param(wi, wavelength, {"profile": "blazed", **relief}, id=name, marks=pytest.mark.slow)
             for name, wi, wavelength, relief in (
-                ("10 µm deep", [0.766, 0.557, 0.321], 0.49, {"period": 10.0, "depth": 10.0}),
                 ("5 µm deep", [0.809, 0.559, 0.182], 0.4763, {"period": 5.0, "depth": 5.0}),
                 ("wide", [-0.979, -0.206, 0.01], 0.621, {"depth": 0.4, "coherence_length": 10.0}),
                 ("wider", [-0.979, -0.206, 0.01], 0.621, {"depth": 0.4, "coherence_length": 2.0}),
