@@ -9,7 +9,7 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import MISSING, fields
 from pathlib import Path
-from typing import Annotated, Any, TypeVar, get_type_hints
+from typing import Annotated, Any, ParamSpec, TypeVar, get_type_hints
 
 import numpy as np
 import typer
@@ -21,6 +21,7 @@ from ..precomputation.requested_surface import RequestedSurface
 from ..precomputation.surface_text import absolute
 from ..progress import say
 
+P = ParamSpec("P")
 Request = TypeVar("Request")
 
 _MAX_VALUES = 10_000  # of a range first:last:step
@@ -50,7 +51,7 @@ KEYS_OF_RECIPES = (
 Variant = Annotated[str | None, typer.Option(help="Mitsuba variant; default: the fastest spectral one")]
 
 
-def as_command(kind: type[Request]) -> Callable[[Callable[[Request], None]], Callable[..., None]]:
+def as_command(kind: Callable[P, Request]) -> Callable[[Callable[[Request], None]], Callable[P, None]]:
     """Make a function of a request a command, whose arguments and options are the fields of the data class `kind`."""
     hints = get_type_hints(kind, include_extras=True)
     parameters = [
@@ -63,10 +64,10 @@ def as_command(kind: type[Request]) -> Callable[[Callable[[Request], None]], Cal
         for field in fields(kind)  # type: ignore[arg-type]
     ]
 
-    def decorate(run: Callable[[Request], None]) -> Callable[..., None]:
+    def decorate(run: Callable[[Request], None]) -> Callable[P, None]:
         @functools.wraps(run)
-        def command(**options: Any) -> None:
-            run(kind(**options))
+        def command(*arguments: P.args, **options: P.kwargs) -> None:
+            run(kind(*arguments, **options))
 
         command.__signature__ = inspect.Signature(parameters)  # type: ignore[attr-defined]
         command.__annotations__ = hints

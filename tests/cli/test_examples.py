@@ -12,7 +12,7 @@ from PIL import Image
 
 import mitsuba_diffraction.inverse_design.hologram as of_picture
 
-hologram = importlib.import_module("mitsuba_diffraction.cli.hologram")  # the package has the command by this name
+render = importlib.import_module("mitsuba_diffraction.cli.render")  # the package has the command by this name
 
 
 def test_examples_are_copied_with_the_files_they_reference(command, tmp_path):
@@ -61,7 +61,7 @@ def test_a_file_instead_of_the_folder_is_one_line(command, where, tmp_path, monk
 
 def test_a_hologram_is_a_scene_with_its_textures(command, tmp_path, monkeypatch):
     rendered = []
-    monkeypatch.setattr(hologram, "render", lambda scene, preview, **options: rendered.append((scene, preview)))
+    monkeypatch.setattr(render, "_render_all", lambda _, scenes, target: rendered.append((scenes[0].path, target)))
     monkeypatch.chdir(tmp_path)
     Image.new("RGB", (30, 20), "red").save("me.png")
     for _ in range(2):  # a second time, as the files are its own
@@ -89,7 +89,7 @@ def test_a_hologram_is_a_scene_with_its_textures(command, tmp_path, monkeypatch)
 
 def test_options_of_a_hologram_are_in_its_scene(command, tmp_path, monkeypatch):
     """The camera sees a smaller hologram as large; its textures are computed for its size."""
-    monkeypatch.setattr(hologram, "render", lambda *_, **__: None)
+    monkeypatch.setattr(render, "_render_all", lambda *_: None)
     monkeypatch.chdir(tmp_path)
     Image.new("RGB", (32, 18), "red").save("me.png")
     for name, options in (("a", ""), ("b", "--size 8 --tilt=-5 --material clear --lamp 1.5")):
