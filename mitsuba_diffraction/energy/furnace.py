@@ -11,8 +11,9 @@ with the gain Γ of lobes at the horizon. a is summed over components of S, each
 
       cos θ → √(2λσ_q) m(x),    m(x) = ∫₀^∞ g(x) g(y) φ(x − y) √((x + y)/2) dy,    x = cos² θ/(2λσ_q)
 
-  with the `horizon_gain` g; m(x) → √x away from the horizon. Where ω is near the horizon, too, and the relief is
-  deeper than λ, K G Γ η_m is integrated over the lobe, in which the two cosines vary together.
+  with the `horizon_gain` g; m(x) → √x away from the horizon. Where ω and the order are near the horizon (x < 4, of one
+  of them x < 8), and the relief is deeper than λ, K G Γ η_m is integrated over the lobe, in which the two cosines vary
+  together.
 - Where orders overlap, and for a sample, a bin of the frequency plane, in which S is accumulated. The part of its
   radial extent that is above the horizon determines its weight and its cosine. Near the mirror direction at grazing
   incidence (1 − b) K G + b Γ replaces K G, as in `Geometry.continuum_factor` of `bsdf/directions.py`.
@@ -57,7 +58,7 @@ MAX_MIRROR_BIN_WIDTH = 0.5  # within the lobe of the mirror direction, in σ_q
 MAX_NODE_POINTS = 6  # on each side along x and y, for a node of S wider than half a bin
 MAX_LOBE_PHASE = 0.1  # radians within one σ of the lobe of an order, above which it is evaluated at several points
 LOBE_POINTS = 9
-MAX_GRAZING = 4.0  # cos² θ/(2λσ_q) of ω and of an order, below which both cosines vary within its lobe
+MAX_GRAZING, MAX_OTHER = 4.0, 8.0  # x of one and of the other of ω and an order, below which both cosines vary
 MIN_POINTS, MAX_POINTS = 7, 24  # in √cos θ_o of such a lobe; one more for each four radians of phase
 MAX_SIGMAS = 3.0
 ACROSS, MAX_ACROSS = 3, 2.2  # points and their cutoff, σ, of the cosine of ω at a given cos θ_o
@@ -267,7 +268,8 @@ class Furnace:
         sigma = length[i] * (self.lobe_scale * self.spectrum.lobe_width)
         # In shallow reliefs the mean of each cosine suffices: K G is large where κ, and with it η, is small.
         grazing = self.spectrum.height_range * self.height_scale > length[i]
-        grazing &= np.maximum(cos_i[i] ** 2, index * square) < 2 * MAX_GRAZING * sigma
+        near, far = np.sort([cos_i[i] ** 2, index * square], axis=0) / (2 * sigma)
+        grazing &= (near < MAX_GRAZING) & (far < MAX_OTHER)
         parts = [(part, both) for part, both in ((~grazing, False), (grazing, True)) if part.any()]
         return [self._order_terms(s, length, i[part], j[part], square[part], branch, both) for part, both in parts]
 
@@ -286,7 +288,7 @@ class Furnace:
         cos_i, sigma = np.sqrt(1 - (s**2).sum(-1))[i], length[i] * width
         phase, weight = 2 * np.pi * self.spectrum.height_range * self.height_scale, np.ones(1)
         if grazing:
-            highest = np.sqrt(2 * (MAX_GRAZING + MAX_SIGMAS) * width / (index * length.min()))
+            highest = np.sqrt(2 * (MAX_OTHER + MAX_SIGMAS) * width / (index * length.min()))
             points = int(min(MIN_POINTS + phase * highest / 4, MAX_POINTS))
             tangent = s[i] + length[i, None] * (branch or 1) * self.q[j]
             mean_cos_i, cos_exit, cos_o, weight = _over_grazing_lobe(s[i], tangent, sigma, index, points)
