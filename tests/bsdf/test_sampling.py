@@ -257,6 +257,46 @@ def test_the_sampler_follows_the_height_scale(llvm):
 # ---------------------------------------------------------------- the samplers
 
 
+@pytest.mark.parametrize("name", ["lamellar", "turned", "crossed"])
+def test_all_light_of_a_continuum_is_drawn_with_its_density(llvm, name):
+    """Up to the horizon, on spirals; and moments of the density on a spiral are those of samples of a lattice."""
+    relief = md.gratings.lamellar(2.5, 0.4) if name != "crossed" else md.gratings.crossed(2.5, 0.25)
+    if name == "turned":
+        relief = md.HeightField(relief.heights.T, relief.pixel_size[::-1])
+    spectrum, wavelength = md.precompute(relief, coherence_length=3.0), 0.5
+    sampler, count, golden = BinSampler(spectrum), 1 << 14, np.pi * (3 - np.sqrt(5))
+    s = direction([0, 25, 50, 70, 85, 85, 89], [0, 10, 130, 290, 180, 95, 355])[:, None]
+
+    def density(tangent):
+        """p of ω_o,∥ = −`tangent`, (directions, n, 2)."""
+        at = [of.ravel() for of in np.moveaxis((tangent - s[..., :2]) / wavelength, -1, 0)]
+        incidence = incidence_of(np.repeat(s, tangent.shape[-2], axis=1).reshape(-1, 3), wavelength)
+        p = sampler.density(mi.Vector2f(*map(floats, at)), incidence, mi.Bool(True))
+        return np.array(p, np.float64).reshape(len(s), -1), np.stack(at, -1).reshape(len(s), -1, 2)
+
+    def spiral(radius):
+        phi = golden * np.arange(len(radius))
+        return radius[None, :, None] * np.stack([np.cos(phi), np.sin(phi)], -1)
+
+    # Light up to the horizon can be drawn.
+    cos = np.linspace(0.002, 1, 2000)
+    p, q = density(spiral(np.sqrt(1 - cos**2)))
+    kappa = 2 * np.pi / wavelength * (s[..., 2] + cos)
+    power = spectrum.evaluate(q, kappa)
+    assert (p[power > 2e-3 * power.max(1, keepdims=True)] > 0).all()
+
+    # The density and that of the samples integrate functions to the same values, 1 to 1.
+    p, q = density(spiral(np.sqrt((np.arange(1 << 17) + 0.5) / (1 << 17))))
+    lattice = (np.arange(count)[:, None] * [1 / count, 0.7548776662466927, 0.5698402909980532]) % 1
+    u = np.tile(lattice.T, len(s)).astype(np.float32)
+    drawn, _ = sampler.sample(incidence_of(np.repeat(s[:, 0], count, axis=0), wavelength), *points(u), mi.Bool(True))
+    dr.eval(drawn)
+    found = np.stack([np.array(of, np.float64) for of in drawn], -1).reshape(len(s), count, 2)
+    for of in (lambda q: np.ones(q.shape[:-1]), lambda q: q[..., 0], lambda q: q[..., 1], lambda q: (q**2).sum(-1)):
+        wanted, got = (p * of(q)).mean(1) * np.pi / wavelength**2, of(found).mean(1)
+        np.testing.assert_allclose(got, wanted, atol=4e-3)
+
+
 @pytest.mark.few(3)
 @pytest.mark.parametrize("name", ["crossed", "column", "sample", pytest.param("elaphe", marks=pytest.mark.slow)])
 @pytest.mark.parametrize(("theta", "phi"), [(0, 0), (40, 130), (85, 250)])
