@@ -152,6 +152,18 @@ def test_no_albedo_of_ridges_is_above_one():
     assert (mean - 3 * error).max() <= 1.01
 
 
+def test_orders_between_nodes_of_a_deep_relief_return_no_more_light_than_they_receive():
+    """Regression: 1.6 and 1.3. At grazing incidence, the orders that return to ω lie within one grid cell of E."""
+    heights = np.kron(2.1 * np.random.default_rng(1).random((2, 3)), np.ones((4, 4)))
+    of = md.precompute(md.HeightField(heights, 0.07), coherence_length=7.7, tolerance=1e-2)
+    theta, phi = (x.ravel() for x in np.meshgrid(np.arange(0.2, 90, 0.4), np.arange(0.4, 360, 0.8)))
+    wo, area = testing.direction(theta, phi), np.sin(np.deg2rad(theta)) * np.deg2rad(0.4) * np.deg2rad(0.8)
+    bsdf = plugin(of)
+    for *omega, wavelength in ((88.84, 177.5, 482.5), (86.64, 272.8, 737.9)):
+        value = testing.evaluate(bsdf, testing.direction(*omega), wo, np.full(4, wavelength))[:, 0]
+        assert 0.05 < area @ value < 1.05
+
+
 @pytest.mark.parametrize("height_scale", [0.3, 0.7])
 def test_no_albedo_above_one_for_scaled_heights(height_scale):
     omega, wavelengths = random_directions(np.random.default_rng(2), 12)
