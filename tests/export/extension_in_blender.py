@@ -64,6 +64,11 @@ def main(extension, tables, saved):
     settings.surface, settings.medium = "foil", "Au"
     bpy.ops.material.diffraction_create()
     messages = [refused(surface="file", file=other) for other in ("/gone.npz", extension, __file__)]
+    settings.surface, settings.medium, settings.coat = "film", "Al", 1.55  # neither is of a film
+    bpy.ops.material.diffraction_create()
+    kinds = {
+        each.bl_idname for each in bpy.context.object.active_material.node_tree.nodes["Diffraction"].node_tree.nodes
+    }
     coated = refused(surface="xenopeltis", medium="own", coat=1.55)
     settings.surface = "compact_disc"
     files = {"coated": f"{saved[:-6]}_coated.blend", "exact": saved}
@@ -79,6 +84,7 @@ def main(extension, tables, saved):
         bpy.ops.wm.open_mainfile(filepath=file)
         means[kind] = mean_of_picture(f"{file}.exr")
     found = {"surfaces": found, "messages": messages, "coated": coated, "means": means, "exact": exact}
+    found |= {"transparent": "ShaderNodeBsdfRefraction" in kinds}
     found |= {"version": bpy.app.version[:2], "valid": is_valid(extension)}
     print("FOUND", json.dumps(found))
 

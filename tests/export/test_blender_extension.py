@@ -8,6 +8,7 @@ import subprocess
 import sys
 import zipfile
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -16,6 +17,7 @@ from scipy.special import jv
 from mitsuba_diffraction.export import blender_extension
 from mitsuba_diffraction.export.node_tables import write_node_tables
 from mitsuba_diffraction.export.shader_tables import ShaderTables
+from mitsuba_diffraction.optics.color import SRGB_TO_XYZ
 from mitsuba_diffraction.precomputation.requested_surface import RequestedSurface
 
 ASSETS = Path(blender_extension.__file__).parent / "assets" / "blender"
@@ -27,12 +29,16 @@ OTHER = os.environ.get("OTHER_BPY_PYTHON")
 BASE = {"edges": np.linspace(0.39, 0.72, 49), "colours": np.ones((1, 48, 3)), "spaces": ["-"], "index": np.zeros(48)}
 
 
-def line_grating(*arguments):
-    """`line_grating` of the extension, which Blender imports as a module of its own."""
-    spec = importlib.util.spec_from_file_location("line_gratings_of_extension", ASSETS / "line_gratings.py")
+def module_of_extension(name):
+    """A module of the extension, which Blender imports as one of its own."""
+    spec = importlib.util.spec_from_file_location(f"{name}_of_extension", ASSETS / f"{name}.py")
     module = importlib.util.module_from_spec(spec)
     spec.loader.exec_module(module)
-    return module.line_grating(*arguments, BASE)
+    return module
+
+
+def line_grating(*arguments):
+    return module_of_extension("line_gratings").line_grating(*arguments, BASE)
 
 
 def test_line_gratings_have_their_closed_forms():
@@ -51,6 +57,45 @@ def test_line_gratings_have_their_closed_forms():
             ),
         }[profile]
         np.testing.assert_allclose(tables["powers"], expected, atol=2e-3)
+
+
+@pytest.fixture
+def nodes(monkeypatch):
+    """The module of the node group, of which some functions do without Blender."""
+    monkeypatch.setitem(sys.modules, "bpy", SimpleNamespace())
+    return module_of_extension("nodes")
+
+
+def test_orders_are_drawn_about_as_often_as_they_are_bright(nodes):
+    period, depth, generator = 1.6, 0.15, np.random.default_rng(1)
+    tables = line_grating("sinusoidal", period, depth, 0.5)
+    rows = nodes._orders(tables).reshape(4, 4, 16, -1, 4)
+    cosine, azimuth, wavelength = generator.uniform([[0.3], [0], [0.42]], [[1], [1], [0.68]], (3, 200))
+    height = 16 / wavelength / (float(tables["max_kappa"]) / (4 * np.pi))
+    excess = []
+    for c_o, phi, light, k in zip(cosine, azimuth, wavelength, height.astype(int), strict=True):
+        slots = rows[int(4 * c_o), int(4 * phi), k]
+        order, numbers = np.unique(np.round(slots[:, 0] * period), return_counts=True)
+        chance = numbers / len(slots)
+        np.testing.assert_allclose(np.sort(1 / slots[:, 3]), np.sort(np.repeat(chance, numbers)))
+        u_o, v_o = np.sqrt(1 - c_o**2) * np.array([-np.cos(2 * np.pi * phi), -np.sin(2 * np.pi * phi)])
+        square = 1 - (u_o + light * order / period) ** 2 - v_o**2
+        c_i = np.sqrt(np.maximum(square, 1e-6))
+        w, v_2 = c_i + c_o, (light * order / period) ** 2 + (c_i + c_o) ** 2
+        k_g = v_2**2 / (4 * c_i * c_o * w**2) * np.minimum(1, 4 * w * np.minimum(c_i, c_o) / v_2)
+        power = np.where(square > 1e-6, jv(order, np.pi * w / light * depth) ** 2 * k_g, 0)
+        excess.append((power**2 / chance).sum() / power.sum() ** 2)
+    assert np.mean(excess) < 1.2  # of noise², beside the order being drawn by its power
+
+
+def test_wavelengths_that_are_drawn_have_the_light_of_their_bins(nodes):
+    edges, colours = np.linspace(0.39, 0.72, 49), np.random.default_rng(2).uniform(0, 3, (1, 48, 3)) ** 2
+    lights = nodes._lights({"edges": edges, "colours": colours}, 0)
+    of_bin = np.digitize(lights[:, 3], edges) - 1
+    summed = np.stack([lights[of_bin == k, :3].sum(axis=0) for k in range(48)])
+    np.testing.assert_allclose(summed / len(lights), colours[0] / 48)
+    luminance = lights[:, :3] @ SRGB_TO_XYZ[1]
+    assert luminance.max() < 1.7 * luminance.mean()  # of the bins, 2.3 times: the brighter, the more often
 
 
 @pytest.mark.parametrize(
@@ -121,6 +166,7 @@ def test_the_extension_is_installed_and_makes_each_material(installed):
     assert "/gone.npz: No such file" in found["messages"][0]
     assert "not tables of mitsuba-diffraction export -o NAME.npz" in found["messages"][1]
     assert "got a coat of index 1.55; these tables are for one of up to 1.08" in found["coated"]
+    assert found["transparent"]
     assert found["exact"]["node"] == "ShaderNodeScript"
     assert found["exact"]["radial"] == 1
     # Files that were opened again and rendered without the extension; without the code and its hash, OSL is black.

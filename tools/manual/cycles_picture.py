@@ -2,13 +2,13 @@
 
 Run it by a Python that has bpy (`pip install bpy==4.5.15`, Python 3.11), and NumPy, which comes with it:
 
-    python tools/manual/cycles_picture.py FILE SHAPE RADIUS|sky SAMPLES SIZE OUT.npy [SPACE]
+    python tools/manual/cycles_picture.py FILE SHAPE RADIUS|sky SAMPLES SIZE OUT.npy [SPACE] [LEFT,RIGHT,LOW,HIGH]
 
 FILE is a shader (.osl), or the tables of the node group (.npz); SHAPE is plane, sphere, disc, or a pane or
-pane_from_behind, with the lamp behind it. In another working SPACE of Blender 5.0 or later, such
-as "Linear Rec.2020", OUT is RGB of that. The wheel has no `oslquery`, by which Blender's
-window finds the sockets of a shader; they are added by hand here. The scene is that of `path_traced` in
-tests/export/test_cycles.py.
+pane_from_behind, with the lamp behind it. In another working SPACE of Blender 5.0 or later, such as "Linear Rec.2020",
+OUT is RGB of that. Four fractions of the picture are a rectangle outside of which it is black. The wheel has no
+`oslquery`, by which Blender's window finds the sockets of a shader; they are added by hand here. The scene is that of
+`path_traced` in tests/export/test_cycles.py.
 """
 
 import contextlib
@@ -113,8 +113,14 @@ def build(shader, shape, light, samples, size, space=None):
     return scene
 
 
-def main(shader, shape, light, samples, size, out, space=None):
+def main(shader, shape, light, samples, size, out, *further):
+    space = next((word for word in further if "," not in word), None)
     scene = build(shader, shape, light, int(samples), int(size), space)
+    render = scene.render
+    for border in (word for word in further if "," in word):
+        render.use_border = True
+        numbers = map(float, border.split(","))
+        render.border_min_x, render.border_max_x, render.border_min_y, render.border_max_y = numbers
     scene.render.filepath = f"{os.path.splitext(out)[0]}.exr"
     began = time.process_time()
     bpy.ops.render.render(write_still=True)

@@ -19,7 +19,7 @@ _READY = {
     "elaphe": "Skin of Elaphe",
     "film": "Diffraction film",
 }
-_NODES_ALONE = ("film",)
+_SHEETS = ("film",)  # transparent and without a coat; nodes alone
 _STAR = "star"
 _FURTHER = {_STAR: "Holographic star", **line_gratings.PROFILES}
 _FILE = "file"
@@ -69,7 +69,7 @@ class DiffractionSettings(bpy.types.PropertyGroup):
     @property
     def has_script(self) -> bool:
         """Whether the extension holds an OSL shader of the surface."""
-        return self.surface in _READY and self.surface not in _NODES_ALONE
+        return self.surface in _READY and self.surface not in _SHEETS
 
     def tables(self) -> dict[str, np.ndarray]:
         """Return the tables of the surface.
@@ -85,11 +85,11 @@ class DiffractionSettings(bpy.types.PropertyGroup):
             tables = line_gratings.line_grating(profile, self.period, self.depth, self.duty, base)
         else:
             tables = nodes.read_tables(os.path.join(_TABLES, f"{self.surface}.npz"))
-        if self.medium == "index":
+        if self.surface in _SHEETS or self.medium == "index":
             tables["index"] = np.full(len(tables["index"]), self.index, np.complex128)
         elif self.medium != "own":
             tables["index"] = np.load(os.path.join(_TABLES, "metals.npz"))[self.medium]
-        tables["coat"] = np.array(self.coat)
+        tables["coat"] = np.array(1.0 if self.surface in _SHEETS else self.coat)
         return tables
 
 
@@ -160,7 +160,9 @@ class MATERIAL_PT_diffraction(bpy.types.Panel):
                 layout.prop(settings, "duty")
         elif settings.has_script:
             layout.prop(settings, "exact")
-        if settings.script is None:
+        if settings.surface in _SHEETS:
+            layout.prop(settings, "index")
+        elif settings.script is None:
             layout.prop(settings, "medium")
             if settings.medium == "index":
                 layout.prop(settings, "index")

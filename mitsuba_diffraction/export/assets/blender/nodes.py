@@ -15,7 +15,10 @@ import bpy
 import numpy as np
 
 _FORMAT = 1  # of the tables
-_SLOTS = 4096  # of orders, each with as many as is its probability
+_LIGHTS = 1024  # slots, of which each bin of wavelengths has as many as is its probability
+_LUMINANCE, _WEIGHT_OF_RGB = np.array([0.2, 0.7, 0.1]), 0.5  # in that probability; of luminance it is 1
+_SLOTS_OF_ORDER, _MIN_SLOTS, _MAX_SLOTS = 12, 256, 4096
+_DIRECTIONS, _SECTORS_OF_AZIMUTH, _HEIGHTS = 4, 4, 16  # of cos θ_o, ω_o and h/λ; each has probabilities of its own
 _COSINES = 64  # of the reflectance
 _AZIMUTHS, _ALBEDO_COSINES = 25, 16
 _REFRACTION = 4.0  # an index that deflects light up to 75°
@@ -192,7 +195,11 @@ class _Nodes:
 
     def between(self, factor: Any, a: Any, b: Any) -> Any:
         """Return the vector a for the factor 0, b for 1."""
-        return self.sum(self.scaled(a, self.subtract(1.0, factor)), self.scaled(b, factor))
+        node = self.node("ShaderNodeMix", data_type="VECTOR")
+        sockets = {socket.identifier: socket for socket in (*node.inputs, *node.outputs)}
+        for name, value in (("Factor_Float", factor), ("A_Vector", a), ("B_Vector", b)):
+            self.put(sockets[name], value)
+        return sockets["Result_Vector"]
 
     def combined(self, x: Any, y: Any, z: Any = 0.0) -> Any:
         node = self.node("ShaderNodeCombineXYZ")
@@ -263,14 +270,13 @@ class _Grating(_Nodes):
         of_light, of_order, _ = self.random(position, 0.5)
 
         # The wavelength, its colour, and the direction from which light of the order comes.
-        colours = tables["colours"][self.space()]
-        edges = tables["edges"]
-        fine = np.interp((np.arange(256) + 0.5) / 256, np.linspace(0, 1, len(edges)), edges)
-        colour = self.table(self.image("colours", np.insert(colours, 3, 1, axis=1)[None]), of_light)[0]
-        wavelength = self.number(self.image("wavelengths", fine[None]), of_light)
+        lights = _lights(tables, self.space())
+        colour, wavelength = self.table(self.image("lights", lights[None]), of_light)
         u_o, v_o, true_c_o = (self.dot(to_camera, axis) for axis in (x, y, normal))
         c_o = self.larger(true_c_o, 1e-4)
-        q_x, q_y, width_x, width_y, u_power, chance = self.drawn(position, of_order)
+        of_heights = self.divide(inputs["HeightScale"], wavelength)
+        azimuth = self.math("MULTIPLY_ADD", self.math("ARCTAN2", v_o, u_o), 0.5 / np.pi, 0.5)
+        q_x, q_y, width_x, width_y, u_power, chance = self.drawn(position, of_order, of_heights, azimuth, c_o)
         step_x, step_y = self.multiply(wavelength, q_x), self.multiply(wavelength, q_y)
         u_i, v_i = self.multiply(self.add(u_o, step_x), -1.0), self.multiply(self.add(v_o, step_y), -1.0)
         square = self.subtract(self.subtract(1.0, self.multiply(u_i, u_i)), self.multiply(v_i, v_i))
@@ -285,7 +291,6 @@ class _Grating(_Nodes):
         true_c_i, true_c_o, c_i, c_o = c_i, c_o, self.inside(c_i), self.inside(c_o)
         w = self.multiply(self.add(c_i, c_o), coat)
         powers, slices = self.image("powers", tables["powers"].T), tables["powers"].shape[1]
-        of_heights = self.divide(inputs["HeightScale"], wavelength)
 
         def power_at(w: Any, powers: bpy.types.Image) -> Any:
             kappa = self.multiply(of_heights, w, 2 * np.pi / float(tables["max_kappa"]))
@@ -296,12 +301,11 @@ class _Grating(_Nodes):
         square_v = self.add(square_step, self.multiply(w, w))
         k = self.divide(self.multiply(square_v, square_v), self.multiply(4.0 * coat**2, c_i, c_o, w, w))
         g = self.smaller(self.divide(self.multiply(4.0 * coat, w, self.smaller(c_i, c_o)), square_v), 1.0)
-        index = tables["index"] / coat
+        index = np.interp(lights[:, 3].reshape(-1, 16).mean(axis=1), _middle(tables), tables["index"]) / coat
         reflectances = self.image("reflectance", _reflectances(index))
         at_facet = self.smaller(self.multiply(self.math("SQRT", square_v), 0.5 / coat), 1.0)
         reflectance = self.number(reflectances, of_light, self.texel(at_facet, _COSINES))
         albedos = self.albedos()
-        azimuth = self.math("MULTIPLY_ADD", self.math("ARCTAN2", v_o, u_o), 0.5 / np.pi, 0.5)
         albedo = self.number(
             self.image("albedo", albedos), self.texel(c_o, albedos.shape[1]), self.texel(azimuth, albedos.shape[0])
         )
@@ -321,7 +325,7 @@ class _Grating(_Nodes):
         else:
             along = self.difference(x, self.scaled(half, self.dot(half, x)))
         tinted = self.vector("MULTIPLY", colour, inputs["Tint"])
-        shaded = self.lobe(self.scaled(tinted, weight), alpha_x, alpha_y, half, self.normalised(along))
+        shaded = self.lobe(self.scaled(tinted, weight), alpha_x, alpha_y, half, along)
         if self.sheet:
             to_other = self.difference(to_light, self.scaled(normal, self.multiply(true_c_i, 2.0)))
             gain, w = self.refracted(self.exchanged(behind, true_c_i, c_o), square_step, reflectances, of_light)
@@ -443,12 +447,26 @@ class _Grating(_Nodes):
         x = self.sum(self.scaled(tangent, self.math("COSINE", turned)), self.scaled(across, self.math("SINE", turned)))
         return x, self.vector("CROSS_PRODUCT", normal, x)
 
-    def drawn(self, position: Any, of_order: Any) -> tuple[Any, Any, Any, Any, Any, Any]:
-        """Return q and its widths, the coordinate of its powers, and one over its probability."""
+    def drawn(
+        self, position: Any, of_order: Any, of_heights: Any, azimuth: Any, c_o: Any
+    ) -> tuple[Any, Any, Any, Any, Any, Any]:
+        """Return q and its widths, the coordinate of its powers, and one over its probability.
+
+        Args:
+            of_heights: h/λ.
+            azimuth: of ω_o, from 0 to 1.
+            c_o: cos θ_o, outside of the coat.
+        """
         count, width = len(self.tables["powers"]), float(self.tables["lobe_width"])
         if self.orders:
-            slots = self.image("orders", _slots(self.tables))
-            values, chance = self.table(slots, of_order)
+            largest = float(self.tables["max_kappa"]) / (4 * np.pi * self.coat)
+            height = self.smaller(self.multiply(of_heights, 1 / largest), 1 - 1e-4)
+            sectors = _SECTORS_OF_AZIMUTH
+            direction = self.math("FLOOR", self.multiply(c_o, _DIRECTIONS * (1 - 1e-6)))
+            sector = self.math("FLOOR", self.multiply(azimuth, sectors * (1 - 1e-6)))
+            row = self.add(self.math("MULTIPLY_ADD", direction, float(sectors), sector), height)
+            row = self.multiply(row, 1 / (_DIRECTIONS * sectors))
+            values, chance = self.table(self.image("orders", _orders(self.tables)), of_order, row)
             q_x, q_y, u_power = self.components(values)
             return q_x, q_y, width, width, u_power, chance
         rows, columns = self.tables["rows"], self.tables["columns"]
@@ -480,26 +498,86 @@ def _middle(tables: Mapping[str, np.ndarray]) -> np.ndarray:
     return (tables["edges"][1:] + tables["edges"][:-1]) / 2
 
 
-def _slots(tables: Mapping[str, np.ndarray]) -> np.ndarray:
-    """Return (1, slots, 4): q_x, q_y, the coordinate of the powers, one over the probability of the order.
+def _shared(weights: np.ndarray, slots: int) -> np.ndarray:
+    """Return the entry that each slot has; an entry has slots in proportion to its weight, and at least one."""
+    numbers = 1 + weights / weights.sum() * (slots - len(weights))
+    return np.minimum(np.searchsorted(np.cumsum(numbers), np.arange(slots) + 0.5), len(weights) - 1)
 
-    The probability is that of the root mean square of the power over the κ of visible light, which has the least noise
-    of all that do not depend on κ.
+
+def _lights(tables: Mapping[str, np.ndarray], space: int) -> np.ndarray:
+    """Return colours and wavelengths of equal probability, (slots, 4)."""
+    colours, edges = tables["colours"][space], tables["edges"]
+    luminance, strength = colours @ _LUMINANCE, np.linalg.norm(colours, axis=1)
+    light = _shared(luminance / luminance.mean() + _WEIGHT_OF_RGB * strength / strength.mean(), _LIGHTS)
+    numbers = np.bincount(light)
+    bounds = np.append(0, np.cumsum(numbers))
+    wavelengths = np.interp(np.arange(_LIGHTS) + 0.5, bounds, edges)
+    weights = _LIGHTS / len(colours) / numbers[light]
+    return np.column_stack([colours[light] * weights[:, None], wavelengths])
+
+
+def _orders(tables: Mapping[str, np.ndarray]) -> np.ndarray:
+    """Return (rows, slots, 4): q_x, q_y, the coordinate of the powers, one over the probability of the order.
+
+    A row is of one cos θ_o, azimuth of ω_o and h/λ, of which the last varies fastest. There the probability of an order
+    is that of its reflected or, for a sheet, transmitted light, a mean over wavelengths and directions.
     """
-    powers, w = tables["powers"], np.linspace(0.8, 2, 13)
-    count, slices = powers.shape
+    coat, count = float(tables.get("coat", 1.0)), len(tables["powers"])
+    slots = int(np.clip(_SLOTS_OF_ORDER * count, _MIN_SLOTS, _MAX_SLOTS))
+    within = np.ix_(np.array([0.25, 0.75]), (np.arange(8) + 0.5) / 8, _middle(tables)[4::10] / coat, [0])
     if tables.get("sheet"):
-        powers = _transmitted(tables)
-        w = (np.median(tables["index"].real) - 1) * np.linspace(0.9, 1.6, 13)
-    kappa = (2 * np.pi / _middle(tables)[:, None] * w).ravel() / float(tables["max_kappa"])
-    at = np.minimum(kappa, 1) * (slices - 1)
+        tables = {**tables, "powers": _transmitted(tables)}
+    shape = (_DIRECTIONS, _SECTORS_OF_AZIMUTH, _HEIGHTS)
+    rows = np.empty((*shape, slots, 4))
+    for direction, sector, height in np.ndindex(shape):
+        c_o = np.sqrt(1 - (1 - ((direction + within[0]) / _DIRECTIONS) ** 2) / coat**2)
+        azimuth = ((sector + within[1]) / _SECTORS_OF_AZIMUTH * 2 - 1) * np.pi
+        kappa_1 = (height + 0.5) / _HEIGHTS * float(tables["max_kappa"]) / 2
+        light = _of_orders(tables, azimuth, c_o, within[2], kappa_1, np.sqrt(1 - coat**-2)).mean(axis=(0, 1, 2))
+        order = _shared(light + 1e-9, slots)
+        chances = slots / np.bincount(order)[order]
+        rows[direction, sector, height] = np.column_stack(
+            [tables["frequencies"][order], (order + 0.5) / count, chances]
+        )
+    return rows.reshape(-1, slots, 4)
+
+
+def _of_orders(
+    tables: Mapping[str, np.ndarray], azimuth: Any, c_o: Any, wavelength: np.ndarray, kappa_1: Any, min_c_i: float
+) -> np.ndarray:
+    """Return the power of each order times K G, along the last axis, or, of a sheet, the transmitted powers.
+
+    Args:
+        azimuth: of ω_o, rad, as all with a last axis of 1.
+        c_o: cos θ_o, inside the coat as the wavelength.
+        wavelength: µm.
+        kappa_1: κ over cos θ_i + cos θ_o.
+        min_c_i: cos θ_i inside the coat, below which there is no light.
+    """
+    q, sine = tables["frequencies"], np.sqrt(1 - c_o**2)
+    u_i, v_i = sine * np.cos(azimuth) + wavelength * q[:, 0], sine * np.sin(azimuth) + wavelength * q[:, 1]
+    square = 1 - u_i**2 - v_i**2
+    c_i = np.sqrt(np.maximum(square, 1e-8))
+    if tables.get("sheet"):
+        excess = float(np.median(tables["index"].real)) ** 2 - 1
+        pairs = ((c_i, c_o), (c_o, c_i))  # at the flat face and the relief, seen from in front and from behind
+        steps = (np.sqrt(flat**2 + excess) - relief for flat, relief in pairs)
+        light = sum(_between(tables["powers"], kappa_1 * w / tables["max_kappa"]) for w in steps)
+    else:
+        w = c_i + c_o
+        square_v = wavelength**2 * (q**2).sum(axis=1) + w**2
+        k_g = square_v**2 / (4 * c_i * c_o * w**2) * np.minimum(1, 4 * w * np.minimum(c_i, c_o) / square_v)
+        light = k_g * _between(tables["powers"], kappa_1 * w / tables["max_kappa"])
+    return light * (square > max(min_c_i**2, 1e-8))
+
+
+def _between(powers: np.ndarray, coordinate: np.ndarray) -> np.ndarray:
+    """Return the powers of orders, along the last axis, at κ relative to its maximum."""
+    count, slices = powers.shape
+    at = np.clip(coordinate, 0, 1) * (slices - 1)
     below = np.minimum(at.astype(int), slices - 2)
-    shown = powers[:, below] * (1 - at + below) + powers[:, below + 1] * (at - below)
-    weights = np.sqrt((shown**2).mean(axis=1))
-    numbers = np.maximum(1, np.round(weights / weights.sum() * (_SLOTS - count))).astype(int)
-    order = np.repeat(np.arange(count), numbers)
-    chances = len(order) / numbers[order]
-    return np.column_stack([tables["frequencies"][order], (order + 0.5) / count, chances])[None]
+    order = np.arange(count)
+    return powers[order, below] * (1 - at + below) + powers[order, below + 1] * (at - below)
 
 
 def _transmitted(tables: Mapping[str, np.ndarray]) -> np.ndarray:
@@ -509,25 +587,12 @@ def _transmitted(tables: Mapping[str, np.ndarray]) -> np.ndarray:
 
 
 def _albedos_of_orders(tables: Mapping[str, np.ndarray]) -> np.ndarray:
-    q, powers = tables["frequencies"], tables["powers"]
-    wavelengths = _middle(tables)[::4, None] / float(tables.get("coat", 1.0))
-    slices = powers.shape[1]
+    wavelength = _middle(tables)[::4, None] / float(tables.get("coat", 1.0))
     albedo = np.zeros((_AZIMUTHS, _ALBEDO_COSINES))
     for j, i in np.ndindex(albedo.shape):
         c_o, azimuth = max(i / (_ALBEDO_COSINES - 1), 0.02), (2 * j / (_AZIMUTHS - 1) - 1) * np.pi
-        sine = np.sqrt(1 - c_o**2)
-        u_i = sine * np.cos(azimuth) + wavelengths * q[:, 0]
-        v_i = sine * np.sin(azimuth) + wavelengths * q[:, 1]
-        square = 1 - u_i**2 - v_i**2
-        c_i = np.sqrt(np.maximum(square, 1e-8))
-        w = c_i + c_o
-        square_v = wavelengths**2 * (q**2).sum(axis=1) + w**2
-        k_g = square_v**2 / (4 * c_i * c_o * w**2) * np.minimum(1, 4 * w * np.minimum(c_i, c_o) / square_v)
-        at = np.minimum(2 * np.pi * w / wavelengths / float(tables["max_kappa"]), 1) * (slices - 1)
-        below = np.minimum(at.astype(int), slices - 2)
-        order = np.arange(len(q))
-        power = powers[order, below] * (1 - at + below) + powers[order, below + 1] * (at - below)
-        albedo[j, i] = (power * k_g * (square > 1e-8)).sum(axis=1).mean()
+        light = _of_orders({**tables, "sheet": False}, azimuth, c_o, wavelength, 2 * np.pi / wavelength, 0.0)
+        albedo[j, i] = light.sum(axis=1).mean()
     return albedo
 
 
