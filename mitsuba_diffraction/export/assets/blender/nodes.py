@@ -524,7 +524,7 @@ def _orders(tables: Mapping[str, np.ndarray]) -> np.ndarray:
     """
     coat, count = float(tables.get("coat", 1.0)), len(tables["powers"])
     slots = int(np.clip(_SLOTS_OF_ORDER * count, _MIN_SLOTS, _MAX_SLOTS))
-    within = np.ix_(np.array([0.25, 0.75]), (np.arange(8) + 0.5) / 8, _middle(tables)[4::10] / coat, [0])
+    within = np.ix_(np.array([0.25, 0.75]), (np.arange(8) + 0.5) / 8, _middle(tables)[4::10] / coat, np.zeros(1))
     if tables.get("sheet"):
         tables = {**tables, "powers": _transmitted(tables)}
     shape = (_DIRECTIONS, _SECTORS_OF_AZIMUTH, _HEIGHTS)
@@ -591,7 +591,7 @@ def _albedos_of_orders(tables: Mapping[str, np.ndarray]) -> np.ndarray:
     albedo = np.zeros((_AZIMUTHS, _ALBEDO_COSINES))
     for j, i in np.ndindex(albedo.shape):
         c_o, azimuth = max(i / (_ALBEDO_COSINES - 1), 0.02), (2 * j / (_AZIMUTHS - 1) - 1) * np.pi
-        light = _of_orders({**tables, "sheet": False}, azimuth, c_o, wavelength, 2 * np.pi / wavelength, 0.0)
+        light = _of_orders({**tables, "sheet": np.array(False)}, azimuth, c_o, wavelength, 2 * np.pi / wavelength, 0.0)
         albedo[j, i] = light.sum(axis=1).mean()
     return albedo
 
