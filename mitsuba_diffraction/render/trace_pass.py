@@ -38,8 +38,9 @@ Rows = tuple[int, int]
 
 # A band of this many pixels, 1024 × 768, takes up to 1.3 GB.
 BAND_PIXELS = 3 * 2**18
-# Kernels, preview and the file of a picture, in addition to what grows with its size.
-_FURTHER_BYTES = 150_000_000
+# Kernels, preview and file of a picture, in addition to what grows with its size; each thread of the file reserves some
+# of the address space.
+_FURTHER_BYTES = 200_000_000
 _GROUP = 4  # neighbouring pixels of which `collect` gathers the samples at once
 _SPOOLED_BYTES = 2**22  # in memory for each band
 

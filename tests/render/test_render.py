@@ -567,7 +567,7 @@ def test_a_picture_that_does_not_fit_into_memory_is_refused_before_it_is_traced(
     path = write_scene(tmp_path, CONSTANT)
     monkeypatch.setattr(passes, "trace_pass", None)
     monkeypatch.setattr(tracing, "available_memory", lambda: 5 * 10**8)
-    refusal = r"3840 × 2160 pixels, which take 935 MB of memory beside the 150 MB of any picture, .* the 500 MB"
+    refusal = r"3840 × 2160 pixels, which take 935 MB of memory beside the 200 MB of any picture, .* the 500 MB"
     with pytest.raises(ValueError, match=refusal):
         render(SceneFile(path, size=(3840, 2160)), spp=8)
     monkeypatch.setattr(tracing, "available_memory", lambda: None)

@@ -378,8 +378,8 @@ def test_compare_writes_pictures_numbers_and_a_figure(command, llvm, folder):
     # The pictures are those of the numbers.
     path, published = (md.render.SpectralImage.load(f"scene-gem-{name}.exr") for name in ("path", "published"))
     xyz = [radiance_to_XYZ(image.radiance, image.wavelengths) for image in (path, published)]
-    surface = Pictures("scene.xml", "gem", width=12, pigment=False).surface
-    again = difference(*xyz, surface, numbers["white"])
+    mask = Pictures("scene.xml", "gem", width=12, pigment=False).mask
+    again = difference(*xyz, mask, numbers["white"])
     assert again.mean == pytest.approx(found["mean"], rel=1e-3)
     with Image.open("scene-gem.png") as picture:
         assert picture.width > 1000

@@ -202,7 +202,7 @@ class Pictures:
         scene_file = SceneFile(scene_path, parameters or {}, size=(width, height))
         _check_lights(scene_file)
         self.scene = scene_file.load()
-        if hasattr(self.scene.integrator(), "quirks"):
+        if hasattr(self.scene.integrator(), "scene_shader"):
             raise RequestError(f"{scene_path}: its integrator is the shader itself, wanted a path tracer (type='path')")
         if (found := recorded_range(self.scene)) != VISIBLE:
             raise RequestError(f"{scene_path}: got a film of {found[0]:g} to {found[1]:g} nm, wanted visible light")
