@@ -105,7 +105,6 @@ class RigorousResult:
         return lobe_powers(bsdf, spectrum, direction(self.angle, 180.0), q, self.wavelength)
 
 
-@functools.cache
 def _plugin(profile: str, period: float, depth: float, material: str) -> tuple[Any, Any]:
     spectrum = spectrum_of(SOLVED_PROFILES[profile](period, depth), coherence_length=200.0, tolerance=1e-4)
     parameters = {"int_ior": 1.5, "ext_ior": 1.0} if material == "dielectric" else {"material": material}
