@@ -268,8 +268,8 @@ class Furnace:
         sigma = length[i] * (self.lobe_scale * self.spectrum.lobe_width)
         # In shallow reliefs the mean of each cosine suffices: K G is large where κ, and with it η, is small.
         grazing = self.spectrum.height_range * self.height_scale > length[i]
-        near, far = np.sort([cos_i[i] ** 2, index * square], axis=0) / (2 * sigma)
-        grazing &= (near < MAX_GRAZING) & (far < MAX_OTHER)
+        lower, higher = np.sort([cos_i[i] ** 2, index * square], axis=0) / (2 * sigma)
+        grazing &= (lower < MAX_GRAZING) & (higher < MAX_OTHER)
         parts = [(part, both) for part, both in ((~grazing, False), (grazing, True)) if part.any()]
         return [self._order_terms(s, length, i[part], j[part], square[part], branch, both) for part, both in parts]
 
