@@ -1,12 +1,15 @@
 """Files from strangers, and mutants of good ones: each is read, or refused in one line, within 10 s and 1 GB of memory.
 
-As a program, in a process of its own: `python strangers.py NAME…` of crafted files, `python strangers.py FORMAT:COUNT…`
-for so many mutants, `python strangers.py SCAN:COUNT…` for those of an instrument's own file. It prints a line for each
-fault.
+As a program: `python strangers.py NAME…` of crafted files, `python strangers.py FORMAT:COUNT…` for so many mutants,
+`python strangers.py SCAN:COUNT…` for those of an instrument's own file. Each is in a process of its own, a copy of the
+program's, and each fault is printed in a line.
 """
 
+import faulthandler
 import functools
+import gc
 import io
+import multiprocessing
 import random
 import re
 import struct
@@ -263,7 +266,7 @@ FORMATS = {
     ),
     "spectrum_rigorous": (
         ".exr",
-        lambda: _spectrum("line", theory="rigorous", material="Al", tolerance=0.5),
+        lambda: _spectrum("line", theory="rigorous", material="Al", tolerance=0.5, wavelengths=(780, 830)),
         load_spectrum,
     ),
     "spectral_image": (".exr", _spectral_image, _read_spectral_image),
@@ -645,6 +648,7 @@ def fault(read, path, refused=None):
 
 def write(path, content):
     """Write a file; a spectrum with the digest that it then has."""
+    path.unlink(missing_ok=True)  # ext4 waits for the disk where a file is written anew
     path.write_bytes(content)
     if path.suffix == ".exr":
         with suppress(ValueError):  # a picture has no placeholder for it
@@ -691,34 +695,72 @@ def _limit_memory():
     resource.setrlimit(resource.RLIMIT_AS, (pages[0] + 2 * MAX_BYTES, resource.RLIM_INFINITY))
 
 
-def _in_this_process(names):
-    """Print the faults of crafted files, and of mutants ("FORMAT:COUNT"), in little memory."""
+def _in_a_copy(name, seconds, action):
+    """Run an action in a copy of this process, which has imported what it needs; one that does not end well is a fault.
+
+    After so many seconds it ends with a traceback of where it was. A copy has no threads but the one that makes it, and
+    would wait for those of OpenEXR.
+    """
+    threads = OpenEXR.global_thread_count()
+
+    def run():
+        OpenEXR.set_global_thread_count(threads)
+        faulthandler.dump_traceback_later(seconds, exit=True)
+        action()
+
+    print(f"{name} …", file=sys.stderr, flush=True)
+    process = multiprocessing.get_context("fork").Process(target=run)
+    OpenEXR.set_global_thread_count(0)
+    process.start()
+    OpenEXR.set_global_thread_count(threads)
+    process.join()
+    if process.exitcode:
+        print(f"{name}: ended with {process.exitcode}", flush=True)
+
+
+def _print_faults_of_mutants(kind, count, folder):
+    _limit_memory()
+    for number, found in faults_of_mutants(kind, count, folder):
+        print(f"{kind} {number}: {found}", flush=True)
+
+
+def _print_fault(name, read, path):
+    _limit_memory()
+    if found := fault(read, path, name not in LARGE):
+        print(f"{name}: {found}", flush=True)
+
+
+def _print_faults(names):
+    """Print the faults of crafted files and of mutants ("FORMAT:COUNT"), each in its own copy, in little memory."""
     crafted = {**CRAFTED, **SLOWLY_CRAFTED, **LARGE}
+    first_of_a_kind = {(suffix, read): kind for kind, (suffix, _, read) in reversed(FORMATS.items())}
     with TemporaryDirectory() as name_of_folder:
         folder = Path(name_of_folder)
-        for name in names:
-            if name in crafted:
-                suffix, make, _ = crafted[name]
-                write(folder / f"{name}{suffix}", make())
-        for name in {name.rpartition(":")[0] for name in names} - {""}:
-            suffix, make, read = format_named(name)
+        np.save(folder / "scan.npy", RELIEF)
+        # What reading imports is not counted, and imported once.
+        kinds = {name.rpartition(":")[0] or first_of_a_kind.get(crafted[name][::2]) for name in names}
+        for kind in kinds - {None}:
+            suffix, make, read = format_named(kind)
             path = folder / f"original{suffix}"
             write(path, make())
-            np.save(folder / "scan.npy", RELIEF)
-            read(path)  # what it imports is not counted
-        _limit_memory()
+            read(path)
+        gc.freeze()
         for name in names:
             kind, _, count = name.rpartition(":")
-            print(f"{name} …", file=sys.stderr, flush=True)
             if kind:
-                for number, found in faults_of_mutants(kind, int(count), folder):
-                    print(f"{kind} {number}: {found}", flush=True)
+                action = functools.partial(_print_faults_of_mutants, kind, int(count), folder)
+                _in_a_copy(name, 60 + int(count) / 2, action)
             else:
-                suffix, _, read = crafted[name]
-                if found := fault(read, folder / f"{name}{suffix}", name not in LARGE):
-                    print(f"{name}: {found}", flush=True)
+                suffix, make, read = crafted[name]
+                path = folder / f"{name}{suffix}"
+                if name in CRAFTED:
+                    write(path, make())
+                else:  # memory that a large file is made in would hide what reading it takes
+                    _in_a_copy(f"making {name}", 60, lambda: write(path, make()))  # noqa: B023
+                _in_a_copy(name, 60, functools.partial(_print_fault, name, read, path))
+                path.unlink(missing_ok=True)
 
 
 if __name__ == "__main__":
     warnings.simplefilter("ignore")
-    _in_this_process(sys.argv[1:])
+    _print_faults(sys.argv[1:])
