@@ -9,7 +9,6 @@ import re
 import runpy
 import shlex
 import shutil
-from functools import partial
 from pathlib import Path
 
 import mitsuba as mi
@@ -154,14 +153,19 @@ def run_xml(text):
     mi.load_file("block.xml")
 
 
+def small_example_scene(surface="compact_disc", example_scene=md.example_scene, **parameters):
+    """The scene that `md.example_scene` returns, of few pixels."""
+    return example_scene(surface, **{"size": 16, **(SMALL_DISC if surface == "compact_disc" else {}), **parameters})
+
+
 @pytest.mark.parametrize(
     "page",
     [pytest.param(page, marks=pytest.mark.slow if page.stem in SLOW else ()) for page in PAGES],
     ids=[page.stem for page in PAGES],
 )
 def test_the_code_of_a_page_runs(page, folder, command, llvm, capfd, monkeypatch):
+    monkeypatch.setattr(md, "example_scene", small_example_scene)
     if page.stem == "README":
-        monkeypatch.setattr(md, "example_scene", partial(md.example_scene, size=16, **SMALL_DISC))
         # Tables of E of few nodes, for this test alone.
         monkeypatch.setattr(table, "MAX_NODE_COMPONENT_PAIRS", 3e5)
         monkeypatch.setattr(table, "_kept", {})

@@ -430,18 +430,18 @@ def image_of_a_wall(bsdf, coherence_length=1.5, x=0, tilt=90):
     [
         pytest.param(two_gratings, 6, 32, 1.4),
         pytest.param(
-            partial(image_of_a_wall, {"type": "plastic"}), 4, 256, 2, id="plastic wall", marks=pytest.mark.slow
+            partial(image_of_a_wall, {"type": "plastic"}), 4, 1024, 2, id="plastic wall", marks=pytest.mark.slow
         ),
         # Mitsuba offsets the origins of rays by 1e-4 of the coordinates.
         pytest.param(
             partial(image_of_a_wall, diffuse(0.8), x=100, tilt=60),
             4,
-            256,
+            1024,
             1,
             id="far from the origin",
             marks=pytest.mark.slow,
         ),
-        pytest.param(partial(image_of_a_wall, diffuse(0.8), 26.0), 4, 256, 4, id="wall", marks=pytest.mark.slow),
+        pytest.param(partial(image_of_a_wall, diffuse(0.8), 26.0), 4, 1024, 4, id="wall", marks=pytest.mark.slow),
     ],
 )
 def test_light_of_two_gratings_is_less_noisy_than_with_path(build, depth, spp, ratio, llvm):
@@ -449,7 +449,7 @@ def test_light_of_two_gratings_is_less_noisy_than_with_path(build, depth, spp, r
     for name in ("path", "diffraction_path"):
         integrator = mi.load_dict({"type": name, "max_depth": depth})
         # Of a wall so many that a single bright path does not decide.
-        count = 192 if depth == 4 else 12
+        count = 48 if depth == 4 else 12
         pictures = np.array([mi.render(built, integrator=integrator, spp=spp, seed=k) for k in range(count)])
         noise.append(pictures.var(0, ddof=1).mean())
         means.append(pictures.mean())
