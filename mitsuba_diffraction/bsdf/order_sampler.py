@@ -149,9 +149,12 @@ class OrderSampler:
         return self.layout.directions(nodes)
 
     def _inside(self, omega: NDArray[np.float64], above: bool, inside: float) -> NDArray[np.float64]:
-        """Return the directions next to the relief, in the index `inside`, from the directions outside."""
-        outside = self._indices(above, inside)[1]
-        tangent = omega[:, :2] * (outside / inside)
+        """Return the directions next to the relief, in the index `inside`, from the directions outside.
+
+        Of light that a sheet reflects totally none enters; it gets the direction at the horizon.
+        """
+        tangent = omega[:, :2] * (self._indices(above, inside)[1] / inside)
+        tangent /= np.maximum(np.sqrt((tangent**2).sum(-1, keepdims=True) / (1 - 1e-12)), 1)
         return np.column_stack([tangent, np.sqrt(np.maximum(1 - (tangent**2).sum(-1), 1e-12))])
 
     def _squared_powers(

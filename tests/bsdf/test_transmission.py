@@ -1,6 +1,7 @@
 """Transmission by a dielectric relief, against closed forms, Mitsuba's own interfaces and quadrature."""
 
 import itertools
+import sys
 
 import drjit as dr
 import mitsuba as mi
@@ -120,6 +121,23 @@ def test_orders_have_the_powers_of_the_closed_form(kind, profile, depth, theta, 
                 found.append(power_of_order(bsdf, kind, wi, order[1]))
         assert len(wanted) > 5
         assert np.abs(np.subtract(found, wanted)).sum() < 0.005 * max(1, np.sum(wanted))
+
+
+def test_a_gap_of_air_in_glass_has_the_powers_of_the_closed_form_and_reflects_totally(monkeypatch):
+    """Regression: light that a sheet reflects totally made NaN of the table that draws orders, which did not load."""
+    monkeypatch.setattr(sys.modules[__name__], "ETA", 1 / ETA)
+    bsdf = transmitting("sheet", depth=0.2, shadowing="none", conserve_energy=False)
+    for side in (1, -1):
+        wi = towards(25, 40, side)
+        orders = [order for m in (-1, 0, 1) if (order := closed_form("sheet", "sinusoidal", 0.2, wi, m)) is not None]
+        found = [power_of_order(bsdf, "sheet", wi, wo) for _, wo in orders]
+        assert np.abs(np.subtract(found, [power for power, _ in orders])).sum() < 0.005
+        for theta in (25, 60):
+            wi = np.broadcast_to(towards(theta, 40, side), (1 << 14, 3))
+            _, weight, bs = testing.sample(bsdf, wi, [WAVELENGTH * 1e3] * 4)
+            transmitted = (weight[:, 0] * (np.array(bs.wo.z) * side < 0)).mean()
+            assert np.isfinite(np.array(bs.pdf)).all()
+            assert transmitted == pytest.approx(sum(power for power, _ in orders) if theta == 25 else 0, abs=0.01)
 
 
 @pytest.mark.slow
