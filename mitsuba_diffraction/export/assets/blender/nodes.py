@@ -20,6 +20,7 @@ _LUMINANCE, _WEIGHT_OF_RGB = np.array([0.2, 0.7, 0.1]), 0.5  # in that probabili
 _SLOTS_OF_ORDER, _MIN_SLOTS, _MAX_SLOTS = 12, 256, 4096
 _DIRECTIONS, _SECTORS_OF_AZIMUTH, _HEIGHTS = 4, 4, 16  # of cos θ_o, ω_o and h/λ; each has probabilities of its own
 _COSINES = 64  # of the reflectance
+_MIN_ROUGHNESS = 0.05  # a lobe of no width meets small lamps by chance alone
 _AZIMUTHS, _ALBEDO_COSINES = 25, 16
 _REFRACTION = 4.0  # an index that deflects light up to 75°
 _SECTORS, _RINGS, _STAR_TURN = 12, 6.0, 5.0  # of a star; turns of the pattern for one around the axis
@@ -212,26 +213,26 @@ class _Nodes:
         self.put(node.inputs[0], a)
         return node.outputs[:3]
 
-    def table(self, image: bpy.types.Image, u: Any, v: Any = 0.5, interpolation: str = "Closest") -> Any:
-        """Return the colour and the alpha of an image at (u, v)."""
+    def table(self, image: bpy.types.Image, u: Any, v: Any = None, interpolation: str = "Closest") -> Any:
+        """Return the colour and the alpha of an image at (u, v), or of one row at u; outside of it, at its edge."""
         node = self.node("ShaderNodeTexImage", interpolation=interpolation, extension="EXTEND")
         node.image = image
-        self.put(node.inputs["Vector"], self.combined(u, v))
+        self.put(node.inputs["Vector"], u if v is None else self.combined(u, v))
         return node.outputs["Color"], node.outputs["Alpha"]
 
-    def number(self, image: bpy.types.Image, u: Any, v: Any = 0.5) -> Any:
+    def number(self, image: bpy.types.Image, u: Any, v: Any = None) -> Any:
         """Return a number between those of an image."""
-        return self.components(self.table(image, u, v, "Linear")[0])[0]
+        return self.table(image, u, v, "Linear")[1]
 
-    def texel(self, x: Any, count: int) -> Any:
-        """Return the coordinate in an image of `count` numbers, the first for x = 0, the last for x = 1."""
-        return self.math("MULTIPLY_ADD", x, (count - 1) / count, 0.5 / count)
+    def texel(self, x: Any, count: int, last: float = 1.0) -> Any:
+        """Return the coordinate in an image of `count` numbers, the first for x = 0, the last for x = `last`."""
+        return self.math("MULTIPLY_ADD", x, (count - 1) / count / last, 0.5 / count)
 
-    def random(self, position: Any, seed: float) -> Any:
+    def random(self, position: Any) -> Any:
         """Return three random numbers; the position of a sample is never twice the same."""
         node = self.node("ShaderNodeTexWhiteNoise", noise_dimensions="4D")
-        self.put(node.inputs["Vector"], self.scaled(position, 7919.7))
-        node.inputs["W"].default_value = seed
+        self.put(node.inputs["Vector"], position)
+        node.inputs["W"].default_value = 0.5
         return self.components(node.outputs["Color"])
 
 
@@ -267,77 +268,78 @@ class _Grating(_Nodes):
         if self.sheet:  # seen from behind, Blender's normal is the other one
             outside = self.scaled(normal, self.math("MULTIPLY_ADD", behind, -2.0, 1.0))
         x, y = self.tangents(inputs, outside)
-        of_light, of_order, _ = self.random(position, 0.5)
+        random = self.random(position)
 
         # The wavelength, its colour, and the direction from which light of the order comes.
         lights = _lights(tables, self.space())
+        of_light = random[0]
         colour, wavelength = self.table(self.image("lights", lights[None]), of_light)
-        u_o, v_o, true_c_o = (self.dot(to_camera, axis) for axis in (x, y, normal))
-        c_o = self.larger(true_c_o, 1e-4)
+        u_o, v_o, c_o = (self.dot(to_camera, axis) for axis in (x, y, normal))
+        c_o = self.larger(c_o, 0.0)
         of_heights = self.divide(inputs["HeightScale"], wavelength)
-        azimuth = self.math("MULTIPLY_ADD", self.math("ARCTAN2", v_o, u_o), 0.5 / np.pi, 0.5)
-        q_x, q_y, width_x, width_y, u_power, chance = self.drawn(position, of_order, of_heights, azimuth, c_o)
+        azimuth = self.math("ARCTAN2", v_o, u_o)
+        q_x, q_y, width_x, width_y, u_power, chance = self.drawn(random[1:], of_heights, azimuth, c_o)
         step_x, step_y = self.multiply(wavelength, q_x), self.multiply(wavelength, q_y)
-        u_i, v_i = self.multiply(self.add(u_o, step_x), -1.0), self.multiply(self.add(v_o, step_y), -1.0)
-        square = self.subtract(self.subtract(1.0, self.multiply(u_i, u_i)), self.multiply(v_i, v_i))
-        propagates = self.multiply(self.math("GREATER_THAN", square, 1e-6), self.math("GREATER_THAN", true_c_o, 1e-4))
-        c_i = self.math("SQRT", self.larger(square, 1e-6))
-        to_light = self.sum(self.scaled(x, u_i), self.scaled(y, v_i), self.scaled(normal, c_i))
-        half = self.normalised(self.sum(to_camera, to_light))
-        c_h = self.larger(self.dot(to_camera, half), 1e-3)
+        u, v = (self.math("MULTIPLY_ADD", wavelength, *each) for each in ((q_x, u_o), (q_y, v_o)))  # of −ω_i
+        # Blender's root of a negative number is 0, and so is a quotient by 0: no weight where a cosine is 0.
+        c_i = self.math("SQRT", self.subtract(1.0, self.math("MULTIPLY_ADD", u, u, self.multiply(v, v))))
+        added = self.scaled(normal, self.add(c_i, c_o))  # ω_i + ω_o
+        added = self.difference(self.difference(added, self.scaled(x, step_x)), self.scaled(y, step_y))
+        half = self.normalised(added)
 
-        # Its weight: R K G and the power at κ over the probability, which E bounds; cosines are those in the coat.
+        # Its weight: R K G E and the power at κ over the probability; cosines are those in the coat times its index.
         coat = self.coat
         true_c_i, true_c_o, c_i, c_o = c_i, c_o, self.inside(c_i), self.inside(c_o)
-        w = self.multiply(self.add(c_i, c_o), coat)
+        w = self.add(c_i, c_o)
         powers, slices = self.image("powers", tables["powers"].T), tables["powers"].shape[1]
 
         def power_at(w: Any, powers: bpy.types.Image) -> Any:
-            kappa = self.multiply(of_heights, w, 2 * np.pi / float(tables["max_kappa"]))
-            return self.number(powers, u_power, self.texel(self.smaller(kappa, 1.0), slices))
+            kappa = self.multiply(of_heights, w)
+            return self.number(powers, u_power, self.texel(kappa, slices, float(tables["max_kappa"]) / (2 * np.pi)))
 
         power = power_at(w, powers)
-        square_step = self.add(self.multiply(step_x, step_x), self.multiply(step_y, step_y))
-        square_v = self.add(square_step, self.multiply(w, w))
-        k = self.divide(self.multiply(square_v, square_v), self.multiply(4.0 * coat**2, c_i, c_o, w, w))
-        g = self.smaller(self.divide(self.multiply(4.0 * coat, w, self.smaller(c_i, c_o)), square_v), 1.0)
+        length = self.vector("LENGTH", added if coat == 1 else self.combined(step_x, step_y, w))
+        # K G = min(1, a / (4 min(c_i, c_o))) a / max(c_i, c_o)
+        a = self.divide(self.multiply(length, length), w)
+        shadowed = self.smaller(self.multiply(self.divide(a, self.smaller(c_i, c_o)), 0.25), 1.0)
+        k_g = self.divide(self.multiply(shadowed, a), self.larger(c_i, c_o))
         index = np.interp(lights[:, 3].reshape(-1, 16).mean(axis=1), _middle(tables), tables["index"]) / coat
         reflectances = self.image("reflectance", _reflectances(index))
-        at_facet = self.smaller(self.multiply(self.math("SQRT", square_v), 0.5 / coat), 1.0)
-        reflectance = self.number(reflectances, of_light, self.texel(at_facet, _COSINES))
-        albedos = self.albedos()
-        albedo = self.number(
-            self.image("albedo", albedos), self.texel(c_o, albedos.shape[1]), self.texel(azimuth, albedos.shape[0])
+        reflectance = self.number(reflectances, of_light, self.texel(length, _COSINES, 2 * coat))
+        factors = 1 / np.maximum(self.albedos(), 1.0)
+        e = self.number(
+            self.image("E", factors),
+            self.texel(c_o, factors.shape[1], coat),
+            self.math("MULTIPLY_ADD", azimuth, (1 - 1 / len(factors)) / (2 * np.pi), 0.5),
         )
-        weight = self.divide(self.multiply(power, chance, k, g, reflectance, propagates), self.larger(albedo, 1.0))
+        weight = self.multiply(power, chance, k_g, reflectance, e)
         if coat > 1:
-            faces = self.image("coat", _reflectances(np.full(2, coat)))
-            at_front, at_back = (self.number(faces, 0.5, self.texel(c, _COSINES)) for c in (true_c_o, true_c_i))
+            faces = self.image("coat", _reflectances(np.full(1, coat)).T)
+            at_front, at_back = (self.number(faces, self.texel(c, _COSINES)) for c in (true_c_o, true_c_i))
             entering = self.subtract(1.0, at_front)
             weight = self.multiply(weight, entering, self.subtract(1.0, at_back))
 
         # The lobe: slopes of facets along the difference of the directions and across, or along x and y of a cell.
-        slope = self.multiply(inputs["Roughness"], wavelength, float(np.sqrt(0.5)))
-        alpha_x = self.smaller(self.larger(self.divide(self.multiply(slope, width_x), true_c_i), 1e-4), 0.7)
-        alpha_y = self.smaller(self.larger(self.divide(self.multiply(slope, width_y), c_h), 1e-4), 0.7)
+        slope = self.multiply(self.larger(inputs["Roughness"], _MIN_ROUGHNESS), wavelength)
+        alpha_x = self.divide(self.multiply(slope, width_x), true_c_i)
+        alpha_y = self.divide(self.multiply(slope, width_y), self.vector("LENGTH", added) if coat > 1 else length)
+        along = x
         if self.orders:  # at the mirror direction any axis does
-            along = self.sum(self.difference(to_light, to_camera), self.scaled(x, 1e-4))
-        else:
-            along = self.difference(x, self.scaled(half, self.dot(half, x)))
+            along = self.sum(self.difference(added, self.scaled(to_camera, 2.0)), self.scaled(x, 1e-4))
         tinted = self.vector("MULTIPLY", colour, inputs["Tint"])
         shaded = self.lobe(self.scaled(tinted, weight), alpha_x, alpha_y, half, along)
         if self.sheet:
-            to_other = self.difference(to_light, self.scaled(normal, self.multiply(true_c_i, 2.0)))
+            mirrored = self.sum(to_camera, self.scaled(normal, self.multiply(true_c_i, 2.0)))
+            to_other = self.difference(added, mirrored)
+            square_step = self.math("MULTIPLY_ADD", step_x, step_x, self.multiply(step_y, step_y))
             gain, w = self.refracted(self.exchanged(behind, true_c_i, c_o), square_step, reflectances, of_light)
             transmitted = power_at(w, self.image("transmitted powers", _transmitted(tables).T))
             width = self.divide(self.multiply(slope, 2.0, width_x), self.math("SQRT", true_c_i))
             of_sheet = self.refraction(to_camera, to_other, width, behind)
-            self.put(
-                of_sheet.inputs["Color"], self.scaled(tinted, self.multiply(gain, transmitted, chance, propagates))
-            )
+            self.put(of_sheet.inputs["Color"], self.scaled(tinted, self.multiply(gain, transmitted, chance)))
             shaded = self.both(shaded, of_sheet)
         elif self.dielectric:
-            into_base = self.subtract(1.0, self.number(reflectances, of_light, self.texel(c_o, _COSINES)))
+            into_base = self.subtract(1.0, self.number(reflectances, of_light, self.texel(c_o, _COSINES, coat)))
             diffuse = self.node("ShaderNodeBsdfDiffuse")
             factor = self.multiply(into_base, _entering(index), entering if coat > 1 else 1.0)
             self.put(diffuse.inputs["Color"], self.scaled(inputs["BaseColor"], factor))
@@ -352,12 +354,12 @@ class _Grating(_Nodes):
     def lobe(self, colour: Any, alpha_x: Any, alpha_y: Any, normal: Any, tangent: Any) -> Any:
         """Return the shader of a lobe of these widths along the tangent and across."""
         # Blender's anisotropy a makes slopes of ratio (1 - a)², narrower along the tangent for a > 0.
-        ratio = self.divide(self.smaller(alpha_x, alpha_y), self.larger(alpha_x, alpha_y))
-        sign = self.math("SIGN", self.subtract(alpha_y, alpha_x))
+        root_x, root_y = (self.math("SQRT", self.smaller(alpha, 0.7)) for alpha in (alpha_x, alpha_y))
         node = self.node("ShaderNodeBsdfAnisotropic", distribution="BECKMANN")
         self.put(node.inputs["Color"], colour)
-        self.put(node.inputs["Roughness"], self.math("POWER", self.multiply(alpha_x, alpha_y), 0.25))
-        self.put(node.inputs["Anisotropy"], self.multiply(self.subtract(1.0, self.math("SQRT", ratio)), sign))
+        self.put(node.inputs["Roughness"], self.math("SQRT", self.multiply(root_x, root_y)))
+        difference = self.subtract(root_y, root_x)
+        self.put(node.inputs["Anisotropy"], self.divide(difference, self.larger(root_x, root_y)))
         self.put(node.inputs["Normal"], normal)
         self.put(node.inputs["Tangent"], tangent)
         return node.outputs[0]
@@ -408,11 +410,10 @@ class _Grating(_Nodes):
         return lobe
 
     def inside(self, cosine: Any) -> Any:
-        """Return the cosine in the coat of a direction of this cosine outside."""
+        """Return the index of the coat times the cosine in it of a direction of this cosine outside."""
         if self.coat == 1:
             return cosine
-        square = self.multiply(cosine, cosine)
-        return self.math("SQRT", self.math("MULTIPLY_ADD", square, 1 / self.coat**2, 1 - 1 / self.coat**2))
+        return self.math("SQRT", self.math("MULTIPLY_ADD", cosine, cosine, self.coat**2 - 1))
 
     def both(self, shaded: Any, other: Any) -> Any:
         """Return the sum of a shader and that of a node."""
@@ -447,43 +448,43 @@ class _Grating(_Nodes):
         x = self.sum(self.scaled(tangent, self.math("COSINE", turned)), self.scaled(across, self.math("SINE", turned)))
         return x, self.vector("CROSS_PRODUCT", normal, x)
 
-    def drawn(
-        self, position: Any, of_order: Any, of_heights: Any, azimuth: Any, c_o: Any
-    ) -> tuple[Any, Any, Any, Any, Any, Any]:
-        """Return q and its widths, the coordinate of its powers, and one over its probability.
+    def drawn(self, random: Any, of_heights: Any, azimuth: Any, c_o: Any) -> tuple[Any, Any, Any, Any, Any, Any]:
+        """Return q, √½ and √2 of its widths, the coordinate of its powers, and one over its probability.
 
         Args:
+            random: two numbers.
             of_heights: h/λ.
-            azimuth: of ω_o, from 0 to 1.
+            azimuth: of ω_o, rad.
             c_o: cos θ_o, outside of the coat.
         """
-        count, width = len(self.tables["powers"]), float(self.tables["lobe_width"])
+        of_order, along_y = random
+        count, width = len(self.tables["powers"]), float(self.tables["lobe_width"]) * 0.5**0.5
         if self.orders:
             largest = float(self.tables["max_kappa"]) / (4 * np.pi * self.coat)
             height = self.smaller(self.multiply(of_heights, 1 / largest), 1 - 1e-4)
             sectors = _SECTORS_OF_AZIMUTH
             direction = self.math("FLOOR", self.multiply(c_o, _DIRECTIONS * (1 - 1e-6)))
-            sector = self.math("FLOOR", self.multiply(azimuth, sectors * (1 - 1e-6)))
+            turns = self.math("MULTIPLY_ADD", azimuth, sectors * (0.5 - 1e-6) / np.pi, 0.5 * sectors)
+            sector = self.math("FLOOR", turns)
             row = self.add(self.math("MULTIPLY_ADD", direction, float(sectors), sector), height)
             row = self.multiply(row, 1 / (_DIRECTIONS * sectors))
             values, chance = self.table(self.image("orders", _orders(self.tables)), of_order, row)
             q_x, q_y, u_power = self.components(values)
-            return q_x, q_y, width, width, u_power, chance
+            return q_x, q_y, width, 2 * width, u_power, chance
         rows, columns = self.tables["rows"], self.tables["columns"]
         low, high = (np.repeat(edges, columns.shape[1] - 1) for edges in (rows[:-1], rows[1:]))
-        cells = np.stack([columns[:, :-1].ravel(), columns[:, 1:].ravel(), low, high], axis=-1)
-        cell = self.smaller(self.math("FLOOR", self.multiply(of_order, float(count))), count - 1.0)
-        u_cell = self.divide(self.add(cell, 0.5), float(count))
-        values, top = self.table(self.image("cells", cells[None]), u_cell)
-        left, right, bottom = self.components(values)
-        along_x, along_y, _ = self.random(position, 17.5)
-        size_x, size_y = self.subtract(right, left), self.subtract(top, bottom)
+        left = columns[:, :-1].ravel()
+        cells = np.stack([left, low, columns[:, 1:].ravel() - left, high - low], axis=-1)
+        below = self.math("SNAP", of_order, 1 / count)
+        along_x = self.multiply(self.subtract(of_order, below), float(count))
+        values, size_y = self.table(self.image("cells", cells[None]), of_order)
+        left, low, size_x = self.components(values)
         return (
             self.math("MULTIPLY_ADD", size_x, along_x, left),
-            self.math("MULTIPLY_ADD", size_y, along_y, bottom),
-            self.larger(self.multiply(size_x, 0.35), width),
-            self.larger(self.multiply(size_y, 0.35), width),
-            u_cell,
+            self.math("MULTIPLY_ADD", size_y, along_y, low),
+            self.larger(self.multiply(size_x, 0.35 * 0.5**0.5), width),
+            self.larger(self.multiply(size_y, 0.35 * 2**0.5), 2 * width),
+            self.add(below, 0.5 / count),
             1.0,
         )
 
