@@ -155,7 +155,7 @@ class OrderSampler:
         """
         tangent = omega[:, :2] * (self._indices(above, inside)[1] / inside)
         tangent /= np.maximum(np.sqrt((tangent**2).sum(-1, keepdims=True) / (1 - 1e-12)), 1)
-        return np.column_stack([tangent, np.sqrt(np.maximum(1 - (tangent**2).sum(-1), 1e-12))])
+        return np.column_stack([tangent, np.sqrt(1 - (tangent**2).sum(-1))])
 
     def _squared_powers(
         self, furnaces: Sequence[Furnace], above: bool, reflects: bool, slice_: float
