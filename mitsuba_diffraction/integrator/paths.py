@@ -288,6 +288,7 @@ _MAX_STARTS_PER_LAUNCH = 2**18  # some 150 MB
 _BRANCHES = 4  # paths of each start
 _NUM_CANDIDATES = 4  # of the first grating vertex and light direction
 _MIN_LIGHT_PATHS, _MAX_LIGHT_PATHS = -6, -1  # log₂ r, see below
+_STOPPING_ALL_RAYS = ("Mesh", "Rectangle", "Disk", "Sphere", "Cylinder")
 _PILOT_PATHS, _LIGHTS_AT_POINT, _PILOT_SEED = 2**13, 16, 0x50494C4F
 
 
@@ -330,6 +331,9 @@ class LightPaths:
         self.max_depth = dr.opaque(mi.UInt32, max_depth % 2**32)
         self.pixels = math.prod(map(int, sensor.film().crop_size()))
         self.rr_depth = dr.opaque(mi.UInt32, rr_depth)
+        # Curves stop rays that come from outside alone: light would leave points of gratings inside of them.
+        stopping = {int(getattr(mi.ShapeType, kind)) for kind in _STOPPING_ALL_RAYS}
+        self.tests_reverse = any(shape.shape_type() not in stopping for shape in scene.shapes())
         self._capacity = float(_BRANCHES)  # contributions that a buffer takes, per start
         self.per_sample = cache.once("light paths", self._number_per_sample)
 
@@ -417,6 +421,8 @@ class LightPaths:
             throughput *= factor
             next_si = self.scene.ray_intersect(ray, active & goes_on)
             goes_on &= next_si.is_valid()
+            if dr.hint(self.tests_reverse, mode="scalar"):
+                goes_on &= self.scene.ray_test(next_si.spawn_ray_to(first_si.p), goes_on & at_start) ^ True
             # Where a path ends, the next branch begins.
             si = dr.select(goes_on, next_si, first_si)
             carried = dr.select(goes_on, carried, power)

@@ -259,6 +259,14 @@ def test_converges_beside_a_curve(llvm, tmp_path):
     assert_agree(curve_beside_a_grating(tmp_path), 4, 1024)
 
 
+def test_no_light_leaves_points_of_a_grating_in_a_curve(llvm, tmp_path):
+    """Regression: rays from the inside of a curve do not meet it, so that paths from the light left it."""
+    path = tmp_path / "curve.txt"
+    path.write_text("".join(f"{x} 0 0.5 0.3\n" for x in (-0.9, -0.3, 0.3, 0.9)))
+    curve = {"type": "linearcurve", "filename": str(path), "bsdf": diffuse(0.5)}
+    assert_agree(scene(curve=curve, plate=plate(blaze(material="Al"), 0.5, 0.4), sun=SUN), 3, 256)
+
+
 @pytest.mark.slow
 @pytest.mark.parametrize("shadows", [True, False], ids=["shadowing", "no shadowing"])
 @pytest.mark.parametrize("flips", [True, False], ids=["flips", "no flips"])
