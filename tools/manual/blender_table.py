@@ -162,7 +162,7 @@ def scene_file(folder, width):
     return path
 
 
-def main(folder, width=1280, samples=192, of_disc=512):
+def main(folder, width=1280, samples=192, of_disc=640):
     folder.mkdir(exist_ok=True)
     meshes(folder)
     tables(folder)
