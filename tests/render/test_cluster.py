@@ -46,6 +46,7 @@ def folder(tmp_path, monkeypatch, small_passes):
     threads = dr.thread_count()
     yield tmp_path
     cluster.scene_of.cache_clear()
+    cluster.light_of.cache_clear()
     dr.set_thread_count(threads)
 
 
@@ -182,6 +183,7 @@ def test_failures_of_a_worker_are_one_line(threads_of_this_process, monkeypatch,
     assert err.splitlines()[-1].endswith("error: a worker cannot load the scene: scene.xml: no such file")
     monkeypatch.setattr(SceneFile, "digest", lambda file: "another" if os.path.isabs(file.path) else digest(file))
     cluster.scene_of.cache_clear()
+    cluster.light_of.cache_clear()
     code, out, err = command(line)
     assert (code, out) == (1, "")
     assert "scene.xml: on a worker, the scene or a file that it references is different" in err.splitlines()[-1]
