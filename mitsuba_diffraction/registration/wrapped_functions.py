@@ -35,11 +35,15 @@ def wrap_functions(plugins: Collection[str]) -> None:
 def _with_short_errors(load: Callable[..., mi.Object], plugins: Collection[str]) -> Callable[..., mi.Object]:
     """Return a loader that accepts a GratingSpectrum in a dict, and reports errors of the plugins in one line.
 
-    The gratings of a scene are made to cover its light.
+    The gratings of a scene are made to cover its light. Unless `parallel` is given, a scene that may have gratings is
+    loaded serially: Mitsuba numbers BSDFs as they are constructed, and Dr.Jit writes kernels in the order of these
+    numbers. In an order of chance, one process in ten compiled kernels that the cache has in the other order.
     """
 
     @functools.wraps(load)
     def loader(scene: dict | str, *args: object, **kwargs: object) -> mi.Object:
+        if not args and _may_have(scene, plugins):
+            kwargs.setdefault("parallel", False)
         try:
             return _with_light(load(hand_over(scene), *args, **kwargs))
         except RequestError as error:
@@ -54,6 +58,16 @@ def _with_short_errors(load: Callable[..., mi.Object], plugins: Collection[str])
         raise RuntimeError(line)
 
     return loader
+
+
+def _may_have(scene: object, plugins: Collection[str]) -> bool:
+    """Return whether a dictionary, the text of a scene or its file names one of the plugins, or includes a file."""
+    if isinstance(scene, dict):
+        return any(_may_have(value, plugins) for value in scene.values())
+    if not isinstance(scene, str):
+        return False
+    text = Path(scene).read_text(errors="replace") if scene.endswith(".xml") and os.path.isfile(scene) else scene
+    return any(name in text for name in (*plugins, "<include"))
 
 
 def _with_models(load: Callable[..., mi.Object]) -> Callable[..., mi.Object]:
