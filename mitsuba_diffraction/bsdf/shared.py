@@ -23,7 +23,7 @@ from .orders import ScalarOrders
 from .varying import Scales
 
 MAX_NODE_PHASE_STEP = 0.5  # radians at the deepest point, between nodes of the ratio of scales in a table of E
-MAX_RATIOS = 16  # number of these nodes
+MAX_RATIOS, MAX_INTERFACE_RATIOS = 32, 16  # number of these nodes; an interface has four tables of E
 SAMPLER_RATIOS = 7  # number of ratios of varying scales; `OrderSampler` has bins for each interval between two
 
 _making = threading.Lock()
@@ -95,7 +95,8 @@ class SharedTables:
         """
         spectrum, (low, high) = self._spectrum, scales.ratios()
         per_step = spectrum.max_kappa * spectrum.height_range / MAX_NODE_PHASE_STEP
-        count = 1 if low == high else int(np.clip(np.ceil((high - low) * per_step), 1, MAX_RATIOS - 1)) + 1
+        max_count = MAX_RATIOS if self.stack is None else MAX_INTERFACE_RATIOS
+        count = 1 if low == high else int(np.clip(np.ceil((high - low) * per_step), 1, max_count - 1)) + 1
         if low == high and any(not scale.varies and dr.grad_enabled(scale.value) for scale in scales):
             # In the middle of two nodes the slope is a central difference. Values are stored as bytes: wide enough.
             half = 1 / max(per_step, 10)

@@ -19,7 +19,7 @@ continuous between. Each unit square of (u, v) is therefore divided into grid ce
 lower edges, where an order is just above the horizon; at u = 0 and v = 0, ω itself is at the horizon. With f the
 fractional part of u, nodes are equidistant in √f, which is proportional to cos θ_o of that order. Where no lobe meets
 the horizon, a depends on u and v alone; where one does, its width in units of c is proportional to 1/c. The table has
-one slice, of a mean c; of reliefs deeper than the longest wavelength, it holds the minimum of e at the maximum and at
+one slice, of a mean c; of reliefs deeper than the shortest wavelength, it holds the minimum of e at the maximum and at
 the minimum of c.
 
 For surfaces with orders in two dimensions, for samples and for interfaces the hemisphere is mapped to a square, with
@@ -245,7 +245,7 @@ class EnergyTable:
         # wavelengths retroreflect light at grazing incidence, where K G is large and grid cells do not resolve lobes:
         # corners of these cells are lowered by twice the difference, of either sign.
         omega, _ = layout.directions(layout.points(0.5), layout.frequencies[0])
-        unresolved_cells = (omega[:, 2] < MAX_GRAZING_COS) & _is_deep(above, layout)
+        unresolved_cells = (omega[:, 2] < MAX_GRAZING_COS) & _is_deeper(above, layout.frequencies[0])
         corners = layout.corners()
         values = np.empty((*of_nodes.shape[:2], *layout.shape), np.uint8)
         for channel in np.ndindex(of_nodes.shape[:2]):
@@ -305,9 +305,9 @@ _keeping = threading.Lock()
 _kept: dict[Hashable, EnergyTable] = {}
 
 
-def _is_deep(furnace: Furnace, layout: Layout) -> bool:
-    """Return whether the relief is deeper than the longest wavelength."""
-    return furnace.spectrum.height_range * furnace.height_scale * layout.frequencies[0] > 1
+def _is_deeper(furnace: Furnace, frequency: float) -> bool:
+    """Return whether the relief is deeper than the wavelength 1/`frequency`."""
+    return furnace.spectrum.height_range * furnace.height_scale * frequency > 1
 
 
 def _bounds(
@@ -324,7 +324,7 @@ def _bounds(
         mirror = 1 if grid.shape[0] == 1 else -1
         used = row <= column if mirror == 1 else row + column <= layout.side
     # Of deep lines, first of the directions with the same u and v that in the plane.
-    of_both = layout.lines and _is_deep(sides[0], layout)
+    of_both = layout.lines and _is_deeper(sides[0], layout.frequencies[1])
     frequency = layout.frequencies[0] if of_both else float(np.mean(layout.frequencies))
     omega, wavelengths = layout.directions(points[used], frequency)
     node = np.flatnonzero(used)

@@ -185,6 +185,35 @@ def test_no_albedo_above_one_for_scaled_lengths():
     assert (mean - 3 * error).max() <= 1.01
 
 
+@pytest.mark.parametrize(
+    ("scale", "omega"),
+    [
+        (0.467, [(88.1, 175, 769), (85, 6, 813), (77.4, -154, 828), (71.4, -146, 760)]),
+        (0.801, [(1.0, 122, 396), (5.2, -125, 504), (9.2, 88, 672), (0.3, -44, 746)]),
+    ],
+)
+def test_no_albedo_above_one_where_the_scale_of_lengths_varies(scale, omega):
+    """Regression: 1.35, as lobes at the horizon had a mean width; and 1.04, between nodes of the ratio of scales."""
+    surface = {"profile": "lamellar", "period": 1.0, "depth": 0.747, "coherence_length": 16.0, "material": "none"}
+    scales = mi.Bitmap(np.array([[scale, 0.467, 0.81, scale]], np.float32)[..., None])
+    texture = {"type": "bitmap", "bitmap": scales, "raw": True, "filter_type": "nearest"}
+    bsdf = mi.load_dict({"type": "diffraction_grating", **surface, "lateral_scale": texture})
+    theta, phi, wavelengths = np.transpose(omega)
+    mean, error = albedos(bsdf, testing.direction(theta, phi), wavelengths, 1 << 14)
+    assert (mean - 3 * error).max() <= 1.01
+    assert mean.min() > 0.5
+
+
+def test_no_albedo_above_one_of_wide_lobes_between_grooves_and_their_plane():
+    """Regression: 1.05 and 1.06, as lobes at the horizon had a mean width."""
+    surface = {"profile": "lamellar", "period": 1.12, "depth": 0.482, "coherence_length": 2.09, "material": "none"}
+    bsdf = mi.load_dict({"type": "diffraction_grating", **surface, "coat_ior": 1.5, "ext_ior": 1.301})
+    omega = testing.direction(np.full(2, 4.9), np.full(2, 229.5))
+    mean, error = albedos(bsdf, omega, np.array([769.1, 785.7]), 1 << 15)
+    assert (mean - 3 * error).max() <= 1.01
+    assert mean.min() > 0.95
+
+
 def energies(bsdf, omega, wavelength):
     """e of the table, (n,)."""
     energy = bsdf.layers.grating.theory.energy
