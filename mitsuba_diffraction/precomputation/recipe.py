@@ -73,7 +73,7 @@ _OF_PROFILE = "coherence_length", "largest_height_range", *REQUESTED
 MAX_RECIPE_BYTES = 2**14  # one of a kilobyte is long; the time and memory of a TOML parser are quadratic in a key
 MAX_PATCHES = 1000  # of which the mean has three per cent of the speckle of one patch
 # Incremented when the same input gives a different result, to invalidate the cache.
-_BUILD_VERSION = 11
+_BUILD_VERSION = 12
 # Spectra in the package (tools/data/ready_spectra.py), named as in the cache.
 READY_SPECTRA = Path(__file__).parents[1] / "data" / "spectra"
 _HEIGHTS_TIME_FRACTION = 0.5  # of the build, spent on the heights of several patches: 0.1 for ridges, 0.9 for skins
