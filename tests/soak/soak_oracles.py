@@ -379,7 +379,8 @@ def compare(case, k, contains, value, density, area, note):
     noise = DEVIATIONS * (np.sqrt(variance / SAMPLES) + grid_error(value)) + 10 * found.max(0) / SAMPLES
     ratio = np.where(density[:, None] > 0, value / np.maximum(density[:, None], 1e-30), 0)
     noise += 20 * ratio.max(0) / SAMPLES
-    floor = 1e-7 if case.c.is_resolved else 1e-4  # between narrow peaks of which the grid has none
+    # Between narrow peaks of which the grid has none; the cut-off tail of another lobe between its outermost points.
+    floor = 1e-5 if case.c.is_resolved else 1e-4
     bad = np.abs(found.mean(0) - integral) > noise + QUADRATURE * integral + floor
     case.require(not bad.any(), "(b) ∫ eval = mean weight", **note, integral=integral, mean=found.mean(0), noise=noise)
     undrawable = (density <= 0) & (value.sum(-1) > 0)
@@ -466,8 +467,11 @@ def bound(case: Case, total):
     c = case.c
     for (wi, _), of_direction in zip(case.directions, total, strict=True):
         limit = 1.02 if wi[2] > 0 or c.transmission == "sheet" else 1.10
-        if c.theory == "rigorous":  # whose tables have a mean error of 0.02, and a larger one at the horizon
-            limit += 0.06 if abs(wi[2]) < 0.1 else 0.03
+        if c.theory == "rigorous":
+            # Tables have a mean error of 0.02, and a larger one at the horizon and near Rayleigh anomalies. Of 14
+            # tables of interfaces, 21000 directions, no sum exceeded 1.011 plus the maximum error of the table.
+            table = case.bsdf.layers.grating.spectrum
+            limit += max(0.06 if abs(wi[2]) < 0.1 else 0.03, table.max_error)
         case.require((of_direction < limit + 0.015).all(), "(e) R + T ≤ bound", wi=wi, got=of_direction, limit=limit)
 
 
@@ -788,12 +792,13 @@ def derivatives_are_differences(case: Case):
     (wi, texel), wavelength = case.directions[0], case.wavelengths[0]
     if c.derived is None or c.polarised or abs(wi[2]) < 0.1:
         return
-    _, wo = case.model.orders(wi, wavelength * 1e-3, bool(wi[2] < 0), c.at(texel))
-    wo = wo[np.abs(wo[:, 2]) > 0.1]
+    m, wo = case.model.orders(wi, wavelength * 1e-3, bool(wi[2] < 0), c.at(texel))
+    m, wo = (x[np.abs(wo[:, 2]) > 0.1] for x in (m, wo))
     if not len(wo):
         return
     # On the slope of the lobe of an order.
-    sun = wo[c.derived % len(wo)] + 0.7 * wavelength * 1e-3 * case.model.sigma_q * np.array([0.6, 0.8, 0])
+    j = c.derived % len(wo)
+    sun = wo[j] + 0.7 * wavelength * 1e-3 * case.model.sigma_q * np.array([0.6, 0.8, 0])
     # An order whose exact direction, from either side, crosses the horizon appears at once: no derivative has that.
     index = case.model.indices(np.array([wi[2] >= 0, sun[2] >= 0]), wavelength * 1e-3)[0]
     half_width = 4 * wavelength * 1e-3 * case.model.sigma_q / index
@@ -841,6 +846,13 @@ def derivatives_are_differences(case: Case):
     brightness = total(0.0)
     if brightness < 1e-3:  # the light of the sky
         return
+    fraction = 1.0
+    if c.theory == "scalar" and c.is_discrete:
+        band = np.linspace(low, high, 61) * 1e-3
+        incident, exit_, order = (np.repeat(v[None], 61, axis=0) for v in (wi, sun / np.linalg.norm(sun), m[j]))
+        common, eta, lobe, _ = case.model.terms(incident, exit_, order, band, c.at(texel))
+        # Of the power of all orders.
+        fraction = max((common * eta * lobe).sum() / (common * lobe).sum(), 1e-3)
     x = like(start)
     dr.enable_grad(x)
     parameters[key] = x
@@ -850,7 +862,9 @@ def derivatives_are_differences(case: Case):
     # Where the tables of two intervals of κ meet, or light interferes in thick films, differences of two steps differ.
     differences = [(total(s) - total(-s)) / (2 * s) for s in (step / 2, step, 2 * step)]
     wanted, error = differences[0], 3 * np.abs(np.diff(differences)).max()
-    error += 0.03 * abs(wanted) + 1e-3 * brightness / max(np.abs(start).max(initial=0), 0.1)
+    error += 0.03 * abs(wanted)
+    # Between intervals of κ a table has steps of up to its tolerance, a fraction of the power of all orders.
+    error += 1e-3 * brightness / fraction / max(np.abs(start).max(initial=0), 0.1)
     case.require(
         np.isfinite(found) and abs(found - wanted) <= error,
         f"(j) derivative by {key.partition('.bsdf.')[2]} through {kind} = difference",
