@@ -10,6 +10,7 @@ from pathlib import Path, PurePosixPath
 
 PROCESS, CONTROL_GROUPS = Path("/proc/self"), Path("/sys/fs/cgroup")
 _MAX_THREADS = 8
+_ARENA_BYTES = 2**26  # of the address space, which malloc of glibc takes for each thread when it first allocates
 
 
 def available_memory() -> int | None:
@@ -60,8 +61,8 @@ def _address_space() -> int | None:
     except ImportError:  # Windows
         return None
     limit, _ = resource.getrlimit(resource.RLIMIT_AS)
-    used = _entries(PROCESS / "status").get("VmSize", 0)
-    return None if limit == resource.RLIM_INFINITY else limit - 1024 * used
+    used = 1024 * _entries(PROCESS / "status").get("VmSize", 0) + _ARENA_BYTES * usable_cores()
+    return None if limit == resource.RLIM_INFINITY else limit - used
 
 
 @contextmanager

@@ -98,17 +98,19 @@ def test_the_limit_of_address_space_counts():
     program = "from mitsuba_diffraction.machine import available_memory; print(available_memory())"
     limited = f"ulimit -v 1000000; exec {sys.executable} -c '{program}'"
     found = int(subprocess.run(["sh", "-c", limited], capture_output=True, check=True, text=True).stdout)
-    assert 0.7 * GB < found < 1.024 * GB
+    limit = 1.024 * GB - machine._ARENA_BYTES * usable_cores()
+    assert limit - 0.3 * GB < found < limit
 
 
 @pytest.mark.slow
 @pytest.mark.posix("ulimit")
-@pytest.mark.parametrize("megabytes", [400, 500, 600, 700, 800, 900, 1000, 1100, 1500])
+@pytest.mark.parametrize("megabytes", [400, 500, 600, 700, 800, 900, 1000, 1100, 1200, 1500])
 def test_a_picture_fits_into_the_address_space_or_is_refused_in_one_line(megabytes, tmp_path):
     scene = Path(__file__).parents[1] / "scenes" / "blaze.xml"
     line = f"render {scene} --width 512 --spp 16 --no-denoise -o {tmp_path}/out.exr"
     limited = f"ulimit -v {megabytes}000; exec {sys.executable} -m mitsuba_diffraction {line}"
     done = subprocess.run(["sh", "-c", limited], capture_output=True, text=True)
-    assert done.returncode == (0 if megabytes >= 1100 else 2), done.stderr
+    # Between, the threads that have allocated so far decide, and whether kernels were compiled.
+    assert done.returncode in ({2} if megabytes < 1000 else {0} if megabytes > 1200 else {0, 2}), done.stderr
     refusals = ("error: memory: got", "error: film: got")
     assert (tmp_path / "out.exr").exists() or any(refusal in done.stderr.splitlines()[-1] for refusal in refusals)

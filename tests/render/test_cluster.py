@@ -43,10 +43,10 @@ def folder(tmp_path, monkeypatch, small_passes):
     small_passes(SIZE)
     monkeypatch.chdir(tmp_path)
     Path("scene.xml").write_text(SCENE)
-    threads = dr.thread_count()
+    threads, caches = dr.thread_count(), (cluster.scene_of, cluster.light_of)  # before a test replaces one
     yield tmp_path
-    cluster.scene_of.cache_clear()
-    cluster.light_of.cache_clear()
+    for cache in caches:
+        cache.cache_clear()
     dr.set_thread_count(threads)
 
 
