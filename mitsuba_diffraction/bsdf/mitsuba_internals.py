@@ -10,7 +10,8 @@ import mitsuba as mi
 # Class names of plugins.
 INSTANCE, SHAPE_GROUP = "Instance", "ShapeGroupPlugin"
 RECTANGLE, DISK, SPHERE = "Rectangle", "Disk", "Sphere"
-MET_FROM_OUTSIDE = "Ellipsoids", "EllipsoidsMesh"  # shapes of which rays miss the back
+# Shapes of which rays miss the back.
+ELLIPSOIDS, CURVES = ("Ellipsoids", "EllipsoidsMesh"), ("LinearCurve", "BSplineCurve")
 TWO_SIDED, BLEND, NORMAL_MAP, BUMP_MAP = "TwoSidedBRDF", "BlendBSDF", "NormalMap", "BumpMap"
 DIFFUSE, ROUGH_CONDUCTOR = "SmoothDiffuse", "RoughConductor"
 DIRECTIONAL, POINT = "DirectionalEmitter", "PointLight"

@@ -8,7 +8,7 @@ import drjit as dr
 import mitsuba as mi
 
 from ..bsdf.light import is_black, recorded_wavelengths
-from ..bsdf.mitsuba_internals import MET_FROM_OUTSIDE, camera_rays, nested_plugin
+from ..bsdf.mitsuba_internals import CURVES, ELLIPSOIDS, camera_rays, nested_plugin
 from ..errors import RequestError
 from ..parameter_documentation import Parameter, listed
 from .eye_paths import EyeTracer, define_eye_paths
@@ -62,11 +62,11 @@ Instances, curves and `sdfgrid` count as X, and so do shapes on which rays do no
 Mitsuba draws there, as on a sphere with a scale that is not uniform. Direct light at an instance is drawn as that at a
 grating.
 
-Without a grating, with max_depth of 0 or 1, in polarised variants, with `ellipsoids` or `ellipsoidsmesh`, which rays of
-Mitsuba 3.9.1 meet from outside only, and for sensors other than `perspective` and `thinlens`, this is `path`. So it is
-with max_depth of 2 where all lights have an extent and are about as bright in all directions. hide_emitters, and films
-with sample_border, are refused. It can be nested in `aov`. Gradients are computed by `path` (forward) and `prb`
-(backward), single rays (`sample`) by `path`.
+Without a grating, with max_depth of 0 or 1, in polarised variants, with `ellipsoids` and curves that transmit light,
+which rays of Mitsuba 3.9.1 meet from outside only, and for sensors other than `perspective` and `thinlens`, this is
+`path`. So it is with max_depth of 2 where all lights have an extent and are about as bright in all directions.
+hide_emitters, and films with sample_border, are refused. It can be nested in `aov`. Gradients are computed by `path`
+(forward) and `prb` (backward), single rays (`sample`) by `path`.
 """
 
 
@@ -162,7 +162,7 @@ def _lit_gratings(scene: mi.Scene, sensor: mi.Sensor, max_depth: int, cache: Sce
     if 0 <= max_depth < 2 or mi.is_polarized:
         return None
     # Paths from the light would have other obstacles than those from the eye.
-    if any(shape.class_name() in MET_FROM_OUTSIDE for shape in scene.shapes()):
+    if any(map(_has_other_obstacles, scene.shapes())):
         return None
     # Points of the scene can be connected to `perspective` and `thinlens`.
     if not implements(sensor.sample_direction, dr.zeros(mi.SurfaceInteraction3f), mi.Point2f(0.5)):
@@ -176,6 +176,13 @@ def _lit_gratings(scene: mi.Scene, sensor: mi.Sensor, max_depth: int, cache: Sce
             "sample_border: got true, wanted false: points outside the film's edge cannot be connected to it"
         )
     return gratings
+
+
+def _has_other_obstacles(shape: mi.Shape) -> bool:
+    """Return whether rays miss the back of a shape that they can enter, so that paths cannot be reversed."""
+    if shape.class_name() in CURVES:
+        return mi.has_flag(shape.bsdf().flags(), mi.BSDFFlags.Transmission | mi.BSDFFlags.Null)
+    return shape.class_name() in ELLIPSOIDS
 
 
 def _is_all_black(scene: mi.Scene, sensor: mi.Sensor, gratings: Gratings, cache: SceneCache) -> bool:

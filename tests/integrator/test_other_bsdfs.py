@@ -6,7 +6,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 import pytest
-from bsdf_support import WAVELENGTHS, array, bitmap, floats, random_directions
+from bsdf_support import WAVELENGTHS, array, bitmap, floats, random_directions, uniform
 from test_diffraction_path import SKY, SUN, assert_agree, blaze, plate, region_means, scene, tilted_normals
 
 from mitsuba_diffraction.bsdf.testing import interaction
@@ -163,3 +163,21 @@ def test_rays_meet_ellipsoids_from_outside_only(llvm, tmp_path, kind):
     lit = scene(shape={"type": kind, "filename": str(path)}, wall=plate(blaze(), 0.5), sun=SUN)
     integrator = mi.load_dict({"type": "diffraction_path"})
     assert integrator.parts(lit, lit.sensors()[0]) == (integrator.path, None)
+
+
+@pytest.mark.parametrize("bsdf", ["roughdielectric", "hair"])
+def test_a_grating_is_seen_through_a_curve_that_transmits_light(llvm, tmp_path, bsdf):
+    """Regression: a quarter of its light was lost, as light from below meets the side that rays from the eye miss."""
+    path = tmp_path / "curve.txt"
+    path.write_text("".join(f"{x} 0 0.5 0.4\n" for x in range(-3, 4)))
+    look = mi.ScalarTransform4f().look_at([0, -2, 4], [0, 0, 0], [0, 0, 1])
+    film = {"type": "hdrfilm", "width": 8, "height": 8, "rfilter": {"type": "box"}}
+    sensor = {"type": "perspective", "fov": 4, "to_world": look, "film": film}
+    curve = {"type": "linearcurve", "filename": str(path), "bsdf": {"type": bsdf}}
+    lamp = {"type": "point", "position": [-1, -1, 2.7], "intensity": uniform(4.0)}
+    built = scene(sensor, curve=curve, plate=plate(blaze(), 3), lamp=lamp)
+    found, expected = (
+        np.array(mi.render(built, integrator=mi.load_dict({"type": name, "max_depth": 4}), spp=512)).mean()
+        for name in ("diffraction_path", "path")
+    )
+    assert found == pytest.approx(expected, rel=0.01)
