@@ -253,9 +253,10 @@ def test_nodes_of_imaginary_k_y_continue_fresnels_formulas(transmission):
 def test_the_table_of_a_ruled_glass_agrees_with_the_solver_for_light_from_inside():
     """With Rayleigh anomalies above and below, also where no order propagates above."""
     surface = gratings.transmission_600()
-    table = md.precompute(surface, theory="rigorous", int_ior=1.52, transmission="interface")
+    settings = {"theory": "rigorous", "wavelengths": (500, 700), "int_ior": 1.52, "transmission": "interface"}
+    table = md.precompute(surface, **settings)
     errors = []
-    for omega, wavelength in zip(hemisphere(40, 3) * [1, 1, -1], np.linspace(0.365, 0.825, 40), strict=True):
+    for omega, wavelength in zip(hemisphere(40, 3) * [1, 1, -1], np.linspace(0.505, 0.695, 40), strict=True):
         exact = rigorous.efficiencies(surface, omega, wavelength, int_ior=1.52)
         wanted = ((False, exact.unpolarised), (True, exact.transmission.unpolarised))
         errors.append(sum(np.abs(table.efficiencies(omega, wavelength, is_t)[1] - eta).sum() for is_t, eta in wanted))
