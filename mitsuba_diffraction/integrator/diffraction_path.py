@@ -161,14 +161,14 @@ def _lit_gratings(scene: mi.Scene, sensor: mi.Sensor, max_depth: int, cache: Sce
     """
     if 0 <= max_depth < 2 or mi.is_polarized:
         return None
-    # Paths from the light would have other obstacles than those from the eye.
-    if any(map(_has_other_obstacles, scene.shapes())):
-        return None
     # Points of the scene can be connected to `perspective` and `thinlens`.
     if not implements(sensor.sample_direction, dr.zeros(mi.SurfaceInteraction3f), mi.Point2f(0.5)):
         return None
     gratings = Gratings(scene, cache)
     if not (gratings.shapes or gratings.instanced) or not scene.emitters():
+        return None
+    # Paths from the light would have other obstacles than those from the eye.
+    if any(map(_has_other_obstacles, (*scene.shapes(), *gratings.members))):
         return None
     film = sensor.film()
     if gratings.shapes and film.sample_border() and film.rfilter().border_size() > 0:

@@ -57,7 +57,8 @@ class Gratings:
 
     Attributes:
         shapes: list of `mi.Shape`.
-        instanced: those of groups, whose instances do not count.
+        members: all shapes of groups, if the scene has instances.
+        instanced: those with gratings, whose instances do not count.
         has_mixture: whether one of the shapes is a mixture, see `is_mixture`.
         are_all: whether no other shape of the scene holds a grating.
         only: whether, in addition, the BSDFs of the shapes consist of gratings only, see `classify`.
@@ -69,8 +70,8 @@ class Gratings:
         self.shapes = [shape for shape, area in zip(shapes, areas, strict=True) if area > 0]
         has_instances = any(shape.class_name() == INSTANCE for shape in scene.shapes())
         groups = [shape for shape in parts(scene, mi.Shape) if shape.class_name() == SHAPE_GROUP]
-        members = [shape for group in groups for shape in parts(group, mi.Shape) if has_instances]
-        self.instanced = [shape for shape in members if gratings_in(shape.bsdf())]
+        self.members = [shape for group in groups for shape in parts(group, mi.Shape) if has_instances]
+        self.instanced = [shape for shape in self.members if gratings_in(shape.bsdf())]
         if self.shapes:
             # Of a list with one number Mitsuba makes a literal.
             self._choice = mi.DiscreteDistribution(on_device([area for area in areas if area > 0]))

@@ -37,7 +37,7 @@ def _with_short_errors(load: Callable[..., mi.Object], plugins: Collection[str])
 
     The gratings of a scene are made to cover its light. Unless `parallel` is given, a scene that may have gratings is
     loaded serially: Mitsuba numbers BSDFs as they are constructed, and Dr.Jit writes kernels in the order of these
-    numbers. In an order of chance, one process in ten compiled kernels that the cache has in the other order.
+    numbers. In an order of chance, some processes compiled kernels that the cache has in the other order.
     """
 
     @functools.wraps(load)

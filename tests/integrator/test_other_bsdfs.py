@@ -165,7 +165,7 @@ def test_rays_meet_ellipsoids_from_outside_only(llvm, tmp_path, kind):
     assert integrator.parts(lit, lit.sensors()[0]) == (integrator.path, None)
 
 
-@pytest.mark.parametrize("bsdf", ["roughdielectric", "hair"])
+@pytest.mark.parametrize("bsdf", ["roughdielectric", "hair", "instance of roughdielectric"])
 def test_a_grating_is_seen_through_a_curve_that_transmits_light(llvm, tmp_path, bsdf):
     """Regression: a quarter of its light was lost, as light from below meets the side that rays from the eye miss."""
     path = tmp_path / "curve.txt"
@@ -173,9 +173,13 @@ def test_a_grating_is_seen_through_a_curve_that_transmits_light(llvm, tmp_path, 
     look = mi.ScalarTransform4f().look_at([0, -2, 4], [0, 0, 0], [0, 0, 1])
     film = {"type": "hdrfilm", "width": 8, "height": 8, "rfilter": {"type": "box"}}
     sensor = {"type": "perspective", "fov": 4, "to_world": look, "film": film}
-    curve = {"type": "linearcurve", "filename": str(path), "bsdf": {"type": bsdf}}
+    curve = {"type": "linearcurve", "filename": str(path), "bsdf": {"type": bsdf.split()[-1]}}
+    parts = {"curve": curve}
+    if bsdf.startswith("instance"):
+        group = {"type": "shapegroup", "curve": curve}
+        parts = {"group": group, "copy": {"type": "instance", "group": {"type": "ref", "id": "group"}}}
     lamp = {"type": "point", "position": [-1, -1, 2.7], "intensity": uniform(4.0)}
-    built = scene(sensor, curve=curve, plate=plate(blaze(), 3), lamp=lamp)
+    built = scene(sensor, **parts, plate=plate(blaze(), 3), lamp=lamp)
     found, expected = (
         np.array(mi.render(built, integrator=mi.load_dict({"type": name, "max_depth": 4}), spp=512)).mean()
         for name in ("diffraction_path", "path")
