@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from ..bsdf.base import gratings_in, gratings_left_out, is_grating
 from ..bsdf.device_tables import on_device
-from ..bsdf.mitsuba_internals import INSTANCE, SHAPE_GROUP, TWO_SIDED, parts
+from ..bsdf.mitsuba_internals import CURVES, INSTANCE, SHAPE_GROUP, TWO_SIDED, parts
 from .scene_cache import SceneCache
 
 
@@ -289,7 +289,6 @@ _MAX_STARTS_PER_LAUNCH = 2**18  # some 150 MB
 _BRANCHES = 4  # paths of each start
 _NUM_CANDIDATES = 4  # of the first grating vertex and light direction
 _MIN_LIGHT_PATHS, _MAX_LIGHT_PATHS = -6, -1  # log₂ r, see below
-_STOPPING_ALL_RAYS = ("Mesh", "Rectangle", "Disk", "Sphere", "Cylinder")
 _PILOT_PATHS, _LIGHTS_AT_POINT, _PILOT_SEED = 2**13, 16, 0x50494C4F
 
 
@@ -333,8 +332,8 @@ class LightPaths:
         self.pixels = math.prod(map(int, sensor.film().crop_size()))
         self.rr_depth = dr.opaque(mi.UInt32, rr_depth)
         # Curves stop rays that come from outside alone: light would leave points of gratings inside of them.
-        stopping = {int(getattr(mi.ShapeType, kind)) for kind in _STOPPING_ALL_RAYS}
-        self.tests_reverse = any(shape.shape_type() not in stopping for shape in scene.shapes())
+        shapes = (*scene.shapes(), *gratings.members)
+        self.tests_reverse = any(shape.class_name() in CURVES for shape in shapes)
         self._capacity = float(_BRANCHES)  # contributions that a buffer takes, per start
         self.per_sample = cache.once("light paths", self._number_per_sample)
 

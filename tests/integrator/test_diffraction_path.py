@@ -259,12 +259,16 @@ def test_converges_beside_a_curve(llvm, tmp_path):
     assert_agree(curve_beside_a_grating(tmp_path), 4, 1024)
 
 
-def test_no_light_leaves_points_of_a_grating_in_a_curve(llvm, tmp_path):
+@pytest.mark.parametrize("is_instance", [False, True])
+def test_no_light_leaves_points_of_a_grating_in_a_curve(llvm, tmp_path, is_instance):
     """Regression: rays from the inside of a curve do not meet it, so that paths from the light left it."""
     path = tmp_path / "curve.txt"
     path.write_text("".join(f"{x} 0 0.5 0.3\n" for x in (-0.9, -0.3, 0.3, 0.9)))
-    curve = {"type": "linearcurve", "filename": str(path), "bsdf": diffuse(0.5)}
-    assert_agree(scene(curve=curve, plate=plate(blaze(material="Al"), 0.5, 0.4), sun=SUN), 3, 256)
+    parts = {"curve": {"type": "linearcurve", "filename": str(path), "bsdf": diffuse(0.5)}}
+    if is_instance:
+        group = {"type": "shapegroup", **parts}
+        parts = {"group": group, "copy": {"type": "instance", "group": {"type": "ref", "id": "group"}}}
+    assert_agree(scene(**parts, plate=plate(blaze(material="Al"), 0.5, 0.4), sun=SUN), 3, 256)
 
 
 @pytest.mark.slow
