@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import math
+
 import drjit as dr
 import mitsuba as mi
 import numpy as np
@@ -101,7 +103,8 @@ def is_black(bsdf: mi.BSDF | None, low: float, high: float) -> bool:
 
 def _at_wavelengths(low: float, high: float) -> mi.SurfaceInteraction3f:
     """Return interactions at wavelengths spread over [low, high] nm."""
-    wavelengths = np.arange(low + STEP / 2, high, STEP)
+    count = math.ceil((high - low) / STEP)
+    wavelengths = low + (np.arange(count) + 0.5) * (high - low) / count
     si = dr.zeros(mi.SurfaceInteraction3f, wavelengths.size)
     si.wavelengths = type(si.wavelengths)(on_device(wavelengths))
     return si

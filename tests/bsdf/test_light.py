@@ -9,7 +9,7 @@ from bsdf_support import albedo, direction, made_up, plugin
 
 import mitsuba_diffraction as md
 from mitsuba_diffraction.bsdf.base import gratings_in
-from mitsuba_diffraction.bsdf.light import _emits
+from mitsuba_diffraction.bsdf.light import _emits, is_black
 from mitsuba_diffraction.precomputation.surface_text import written
 from mitsuba_diffraction.settings import ScalarSettings
 
@@ -127,6 +127,20 @@ def test_wavelengths_without_light_need_no_table(llvm):
     (bsdf,) = {bsdf for shape in loaded.shapes() for bsdf in gratings_in(shape.bsdf())}
     shortest, longest = bsdf.layers.grating.theory.light
     assert 500 <= shortest <= 530 < 534 <= longest
+
+
+def test_a_table_that_ends_a_fraction_of_a_nanometre_before_the_light_is_refused(llvm):
+    # Regression: an error of Dr.Jit, as no wavelength was tried between them.
+    grating = {"type": "diffraction_grating", "spectrum": spectrum(360.1, 830)}
+    with pytest.raises(RuntimeError, match=r"got light from 360 nm, and a spectrum for wavelengths from 360\.1 nm"):
+        mi.load_dict(scene(grating))
+    band = {"type": "regular", "wavelength_min": 360.1, "wavelength_max": 830.0, "values": "1, 1"}
+    mi.load_dict(scene(grating, light=band))
+
+
+def test_a_white_surface_is_not_black_in_a_narrow_band(llvm):
+    # Regression: no wavelength was tried.
+    assert not is_black(mi.load_dict({"type": "diffuse"}), 550.0, 550.1)
 
 
 def test_a_spectrum_that_is_not_of_the_emission_does_not_make_a_light_dark(llvm):
