@@ -261,8 +261,10 @@ class RandomScene:
         return path
 
     def curve(self):
+        """A curve, and out of sight another: Mitsuba reads beyond the end of the last one (docs/integrators.md)."""
         path = self.file("curve.txt")
-        path.write_text("-1 0 0.5 0.15\n0 0 0.8 0.15\n0.5 0.5 0.6 0.15\n1 0.5 0.5 0.15\n1.5 0.7 0.5 0.15\n")
+        seen = "-1 0 0.5 0.15\n0 0 0.8 0.15\n0.5 0.5 0.6 0.15\n1 0.5 0.5 0.15\n1.5 0.7 0.5 0.15\n"
+        path.write_text(seen + "\n" + "".join(f"{x} 0 -3 1e-4\n" for x in range(4)))
         return path
 
     def distances(self):

@@ -11,13 +11,15 @@ import gc
 import time
 import traceback
 
+import drjit as dr
 import hypothesis
+import mitsuba as mi
 import pytest
 from hypothesis import HealthCheck, Phase, given, settings
 from soak_grammar import Configuration, Surface, configurations
 from soak_model import Cauchy
 from soak_oracles import judge
-from soak_scenes import judge_scene, spectra
+from soak_scenes import RandomScene, judge_scene, spectra
 
 pytestmark = [
     pytest.mark.filterwarnings("ignore:pixels of"),
@@ -153,6 +155,21 @@ def test_random_configurations(llvm, tmp_path, pytestconfig, capsys, fixed):
     if fixed > 1:
         pytest.skip("these seeds were judged by the test of one configuration")
     repeat(lambda seed: explore(seed, EXAMPLES, tmp_path, shrink=False), "configurations", minutes, seed, capsys)
+
+
+def test_curves_of_scenes_end_within_their_arrays(llvm, tmp_path):
+    """Seed 230210: the process ended where a ray met the end of the last curve."""
+    curves = mi.load_dict({"type": "bsplinecurve", "filename": str(RandomScene(1, tmp_path, {}).curve())})
+    found = dr.zeros(mi.PreliminaryIntersection3f)
+    found.t, found.shape, found.prim_uv = mi.Float(1), mi.ShapePtr(curves), mi.Point2f(1, 0)
+    ray = mi.Ray3f([0, 0, 3], [0, 0, -1])
+    assert curves.primitive_count() == 3
+    with dr.scoped_set_flag(dr.JitFlag.Debug):  # reports what is read beyond an array
+        found.prim_index = mi.UInt32(1)  # the last segment in sight
+        dr.eval(curves.compute_surface_interaction(ray, found))
+        found.prim_index = mi.UInt32(2)
+        with pytest.raises(RuntimeError, match="out-of-bounds"):  # of Mitsuba 3.9.1; with a later one, draw one curve
+            dr.eval(curves.compute_surface_interaction(ray, found))
 
 
 @pytest.mark.slow
