@@ -261,7 +261,7 @@ class RandomScene:
         return path
 
     def curve(self):
-        """A curve, and out of sight another: Mitsuba reads beyond the end of the last one (docs/integrators.md)."""
+        """A curve, and out of sight another: Mitsuba may crash at the end of the last one (docs/integrators.md)."""
         path = self.file("curve.txt")
         seen = "-1 0 0.5 0.15\n0 0 0.8 0.15\n0.5 0.5 0.6 0.15\n1 0.5 0.5 0.15\n1.5 0.7 0.5 0.15\n"
         path.write_text(seen + "\n" + "".join(f"{x} 0 -3 1e-4\n" for x in range(4)))

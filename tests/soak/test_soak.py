@@ -164,7 +164,7 @@ def test_curves_of_scenes_end_within_their_arrays(llvm, tmp_path):
     found.t, found.shape, found.prim_uv = mi.Float(1), mi.ShapePtr(curves), mi.Point2f(1, 0)
     ray = mi.Ray3f([0, 0, 3], [0, 0, -1])
     assert curves.primitive_count() == 3
-    with dr.scoped_set_flag(dr.JitFlag.Debug):  # reports what is read beyond an array
+    with dr.scoped_set_flag(dr.JitFlag.Debug):  # reports what is read outside of an array
         found.prim_index = mi.UInt32(1)  # the last segment in sight
         dr.eval(curves.compute_surface_interaction(ray, found))
         found.prim_index = mi.UInt32(2)
